@@ -30,6 +30,7 @@ from ibrobot_planning.client import Client
 from ibrobot_planning.execution.requests import GoTo
 from ibrobot_planning.goals.text import Target
 from ibrobot_planning.world.objects import Box, World, WorldObject
+from ibrobot_ros2.calls import GoalRequest
 from ibrobot_ros2.goals import Actions
 from planning import Referee
 from planning_scenes import ARM_JOINTS
@@ -176,8 +177,8 @@ class Robot:
         self.runtime = runtime
         self.session = runtime.session
         self.commands: list[Vector] = []
-        self.heads: list[Mapping[str, Any]] = []
-        """The results and rejections that ROS clients receive."""
+        self.ends: dict[int, tuple[str, Mapping[str, Any]]] = {}
+        """State and result of ROS goals that ended or were refused, by number."""
         self.actions = Actions(
             self.session, [ARM, "gripper_action"], lambda name: False, lambda name: name, "ros", "GripperCommand"
         )
@@ -194,9 +195,15 @@ class Robot:
             "task": self.by_task,
         }
 
-    def send(self, head: Mapping[str, Any]) -> None:
-        """Take what the run says of its actions."""
-        self.heads.append(head)
+    def offer(self, name: str, type_name: str, *, executor: str = "", service: str = "") -> None:
+        """As if a client were there."""
+
+    def feed(self, goal: int, values: Mapping[str, Any]) -> None:
+        """Drop feedback."""
+
+    def end(self, goal: int, state: str, values: Mapping[str, Any]) -> None:
+        """Take the result of a goal."""
+        self.ends[goal] = state, values
 
     def _take(self, event: Mapping[str, Any]) -> None:
         self._events.append(event)
@@ -223,19 +230,15 @@ class Robot:
             self.step()
             still = still + 1 if np.abs(self.command - before).max() < 1e-6 else 0
 
-    def ended(self, number: int) -> Mapping[str, Any] | None:
-        """The end of a ROS goal."""
-        return next((each for each in self.heads if each["op"] == "ended" and each["goal"] == number), None)
-
     def by_ros(self, goal: Goal) -> tuple[Verdict, Any]:
         """Send a goal as a ROS action; with its number."""
         self._number += 1
         number = self._number
-        head = {"goal": number, "executor": ARM, "fields": goal.ros(self.session.clock.now_ns())}
-        if not self.actions.take_goal(self, head, self.session.stops):
+        request = GoalRequest(number, goal.ros(self.session.clock.now_ns()), ARM)
+        if not self.actions.take_goal(self, request, self.session.stops):
             return Verdict(False, "rejected without a reason"), number
-        end = self.ended(number)
-        return (Verdict(True), number) if end is None else (Verdict(False, end["values"]["error_string"]), number)
+        end = self.ends.get(number)
+        return (Verdict(True), number) if end is None else (Verdict(False, end[1]["error_string"]), number)
 
     def by_service(self, goal: Goal) -> tuple[Verdict, Any]:
         """Send a goal to `/execute_trajectory`."""
@@ -288,8 +291,9 @@ class Robot:
         """Let a goal end; returns what went wrong."""
         for _ in range(round(EXECUTED_S * 100)):
             if entrance == "ros":
-                if (end := self.ended(number)) is not None:
-                    return "" if end["state"] == "succeeded" else f"{end['state']}: {end['values']['error_string']}"
+                if (end := self.ends.get(number)) is not None:
+                    state, values = end
+                    return "" if state == "succeeded" else f"{state}: {values['error_string']}"
             elif (result := self.session.bus.call("/planning/result", number)) is not None:
                 return "" if result.success else str(result.message)
             self.step()
@@ -547,7 +551,7 @@ class Trial:
             verdicts[name] = verdict
             tally.asked[f"{name} {'accepted' if verdict.accepted else 'refused'}"] += 1
             if not verdict.accepted:
-                if name == "ros" and made.ended(address) is None:
+                if name == "ros" and address not in made.ends:
                     tally.wrong.append(f"goal {number}: no result: {goal}")
                 if np.abs(made.command - here).max() > 0:
                     tally.wrong.append(f"goal {number} ({goal.kind}) was refused by {name}, and moved the arm: {goal}")

@@ -55,7 +55,7 @@ SUBSCRIBERS = {
             "ibrobot_gym/environment.py", "ibrobot_mujoco/camera.py", "ibrobot_mujoco/viewer.py",
             "ibrobot_planning/tasks/performing.py", "ibrobot_ros/topics.py", "ibrobot_ros2/inference.py",
             "ibrobot_kinematics/tool_pose.py", "ibrobot_web/objects.py", "ibrobot_web/viewer.py",
-            "ibrobot_webxr/images.py", "ibrobot_webxr/server.py", "ibrobot_zenoh/sharing.py",
+            "ibrobot_webxr/images.py", "ibrobot_webxr/server.py", "ibrobot_zenoh/shared_topics.py",
             # The world.
             "ibrobot_planning/world/clouds.py", "ibrobot_planning/world/frames.py",
             "ibrobot_planning/world/section.py",

@@ -12,6 +12,7 @@ import goal_entrances
 import numpy as np
 import pytest
 from goal_entrances import ARM, ARM_JOINTS, LEFT, Goal, Robot, tolerance
+from ibrobot_ros2.calls import GoalRequest
 from ibrobot_ros2.goals import TrajectoryCode
 
 pytestmark = pytest.mark.integration
@@ -131,9 +132,8 @@ def test_result_of_a_refused_goal_says_why(robot: Robot, case: str):
     verdict, number = robot.by_ros(asked)
     assert not verdict.accepted
     assert why in verdict.message
-    end = robot.ended(number)
-    assert end is not None
-    assert (end["state"], end["values"]["error_code"]) == ("aborted", code)
+    state, values = robot.ends[number]
+    assert (state, values["error_code"]) == ("aborted", code)
     for _ in range(20):
         robot.step()
     np.testing.assert_array_equal(robot.commands, np.tile(robot.commands[0], (len(robot.commands), 1)))
@@ -176,9 +176,7 @@ def test_next_goal_takes_over_from_the_one_under_way(robot: Robot):
     verdict, new = robot.by_ros(goal(point(1.5, beside(0.2))))
     assert verdict.accepted, verdict
     assert robot.finish("ros", new) == ""
-    end = robot.ended(old)
-    assert end is not None
-    assert "replaced" in end["values"]["error_string"]
+    assert "replaced" in robot.ends[old][1]["error_string"]
     np.testing.assert_allclose(robot.command, beside(0.2), atol=1e-6)
     within_limits(robot)
     moved = np.abs(np.diff(np.array(robot.commands)[:, 0]))
@@ -227,21 +225,17 @@ def test_goal_stops_before_what_comes_into_its_way(robot: Robot):
 
 def test_goal_older_than_a_stop_is_refused(robot: Robot):
     session = robot.session
-    head = {"goal": 90, "executor": ARM, "fields": goal(point(2, beside(0.1))).ros(0)}
+    request = GoalRequest(90, goal(point(2, beside(0.1))).ros(0), ARM)
     stops = session.stops
     session.emergency_stop()
     robot.runtime.step()
-    assert robot.actions.take_goal(robot, head, stops)
-    end = robot.ended(90)
-    assert end is not None
-    assert "before a reset" in end["values"]["error_string"]
+    assert robot.actions.take_goal(robot, request, stops)
+    assert "before a reset" in robot.ends[90][1]["error_string"]
     for _ in range(30):
         robot.runtime.step()
     robot.runtime.reset()
-    assert robot.actions.take_goal(robot, {**head, "goal": 91}, stops)
-    end = robot.ended(91)
-    assert end is not None
-    assert "a stop, a reset or another mode came after" in end["values"]["error_string"]
+    assert robot.actions.take_goal(robot, attrs.evolve(request, number=91), stops)
+    assert "a stop, a reset or another mode came after" in robot.ends[91][1]["error_string"]
     assert robot.by_ros(goal(point(2, beside(0.1))))[0].accepted
     robot.drop()
 
@@ -276,8 +270,8 @@ def test_flood_of_refused_goals_does_not_flood_the_log(robot: Robot, caplog: pyt
 )
 def test_goals_of_grippers_are_plausible(robot: Robot, command: dict[str, float]):
     fields = {"command": {"position": 0.5, "max_effort": 0.0, **command}}
-    head = {"goal": 95, "executor": "gripper_action", "fields": fields}
-    assert not robot.actions.take_goal(robot, head, robot.session.stops), "their results have no place for a reason"
+    request = GoalRequest(95, fields, "gripper_action")
+    assert not robot.actions.take_goal(robot, request, robot.session.stops), "their results have no place for a reason"
 
 
 def test_goal_under_check_is_not_followed_after_a_fault_and_its_reset(robot: Robot, monkeypatch: pytest.MonkeyPatch):

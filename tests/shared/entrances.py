@@ -32,6 +32,7 @@ from ibrobot_gym.environment import RobotEnv
 from ibrobot_lerobot_devices import teleop as lerobot_teleop
 from ibrobot_lerobot_program.features import RobotFeatures
 from ibrobot_lerobot_program.run import ProgramSource
+from ibrobot_ros2.calls import GoalRequest
 from ibrobot_ros2.goals import Actions
 from ibrobot_web import commands as page_commands
 from ibrobot_web.messages import Sent, from_page, from_server, to_run
@@ -390,13 +391,13 @@ class Task(Entrance):
 
 
 class _Wire:
-    """What passes heads to clients of ROS."""
+    """Clients of ROS that listen to nothing."""
 
-    def __init__(self) -> None:
-        self.heads: list[Mapping[str, Any]] = []
+    def offer(self, name: str, type_name: str, *, executor: str = "", service: str = "") -> None: ...
 
-    def send(self, head: Mapping[str, Any]) -> None:
-        self.heads.append(head)
+    def feed(self, goal: int, values: Mapping[str, Any]) -> None: ...
+
+    def end(self, goal: int, state: str, values: Mapping[str, Any]) -> None: ...
 
 
 def _ros_time(time_s: float) -> dict[str, int]:
@@ -427,8 +428,8 @@ class FollowJointTrajectory(Execute):
     def give(self, fields: dict[str, Any], stops: int | None = None) -> bool:
         """Send a goal, received after `stops` emergency stops; by default now."""
         stops = self.run.session.stops if stops is None else stops
-        head = {"goal": next(self._numbers), "executor": self.executor, "fields": fields}
-        return self.actions.take_goal(self.wire, head, stops)
+        request = GoalRequest(next(self._numbers), fields, self.executor)
+        return self.actions.take_goal(self.wire, request, stops)
 
     def fields(self, points: list[dict[str, Any]], stamp_s: float = 0.0, **tolerances: Any) -> dict[str, Any]:
         """The fields of a goal."""

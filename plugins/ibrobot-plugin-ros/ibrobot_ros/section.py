@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, override
 
+import attrs
+from ibrobot_ros2.calls import GoalRequest
 from ibrobot_ros2.goals import Actions, with_goals
 
 from ibrobot_core.api import DiagnosticArray, DiagnosticStatus, Header, KeyValue, NotSupported
@@ -34,6 +36,23 @@ _STATUS_S = 1.0
 _STOP_S = 5.0
 _END_S = 1.0
 """Longest time for sending the rest at the end [s]."""
+
+
+@attrs.frozen
+class _Node:
+    """Passes what the run says of its actions to the node's process."""
+
+    channel: Channel
+
+    def offer(self, name: str, type_name: str, *, executor: str = "", service: str = "") -> None:
+        address = {"executor": executor} if executor else {"service": service}
+        self.channel.send({"op": "action", "name": name, "type": type_name, **address})
+
+    def feed(self, goal: int, values: Mapping[str, Any]) -> None:
+        self.channel.send({"op": "feedback", "goal": goal, "values": values})
+
+    def end(self, goal: int, state: str, values: Mapping[str, Any]) -> None:
+        self.channel.send({"op": "ended", "goal": goal, "state": state, "values": values})
 
 
 class RosNode(Component):
@@ -147,7 +166,7 @@ class RosNode(Component):
         self.topics.declare(channel)
         self._services.declare(channel)
         if not self._lockstep:
-            self._actions.declare(channel)
+            self._actions.declare(_Node(channel))
         self._channel = channel
 
     def _send(self) -> None:
@@ -193,7 +212,7 @@ class RosNode(Component):
             self._pinged_s = now_s
             channel.send({"op": "ping"})
             self._services.refresh(channel)
-            self._actions.refresh(channel)
+            self._actions.refresh(_Node(channel))
         silent_s = now_s - self._heard_s
         if silent_s > _SILENT_S and not self._trouble:
             assert self._node is not None
@@ -247,10 +266,12 @@ class RosNode(Component):
 
     def _decide(self, channel: Channel, head: dict[str, Any], stops: int) -> None:
         """Answer a goal, or a cancel, which was received after `stops` emergency stops."""
-        number, actions = head["goal"], self._actions
-        accepted = (
-            actions.cancel(channel, number) if head["op"] == "cancel" else actions.take_goal(channel, head, stops)
-        )
+        number, node = head["goal"], _Node(channel)
+        if head["op"] == "cancel":
+            accepted = self._actions.cancel(node, number)
+        else:
+            address = {key: head[key] for key in ("executor", "service") if key in head}
+            accepted = self._actions.take_goal(node, GoalRequest(number, head["fields"], **address), stops)
         channel.send({"op": "decided", "goal": number, "accepted": accepted})
 
     def _note_flood(self, topic: str, count: int) -> None:

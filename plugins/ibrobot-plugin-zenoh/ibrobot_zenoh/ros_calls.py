@@ -16,9 +16,9 @@ from ibrobot_ros2.workers import StopWay, Workers
 
 from ibrobot_core.api import TransportError
 from ibrobot_zenoh.connection import first_line
+from ibrobot_zenoh.network import Reply, RosHandler
 from ibrobot_zenoh.own_query import OwnQuery, Query, attachment_of
 from ibrobot_zenoh.ros2 import attachment, caller_of, sent_of
-from ibrobot_zenoh.sharing import Reply, RosHandler
 
 _WORKERS, _URGENT_WORKERS = 4, 2
 _CHECK_S = 10.0

@@ -12,7 +12,7 @@ from ibrobot_ros2.interfaces import service_type
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import SET_MODE, Component, RunView, TransportLink, dump_yaml
 from ibrobot_zenoh.arrivals import Arrivals
-from ibrobot_zenoh.sharing import Reply, transport_of
+from ibrobot_zenoh.network import Reply, transport_of
 
 MODE = "mode"
 """The parameter that is the control mode."""

@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any, Literal, override
 
 import attrs
+from ibrobot_ros2.calls import GoalRequest
 from ibrobot_ros2.goals import Actions, with_goals
 from ibrobot_ros2.interfaces import ActionType, ServiceType, action_type, fields_of, service_type, to_cdr
 from ibrobot_ros2.offers import TRIGGER, Offer, Offers, refused, time_of
@@ -18,10 +19,10 @@ from ibrobot_ros2.workers import StopWay
 from ibrobot_core.api import NS_PER_S, HardwareError, IbrobotError, NotSupported, did_you_mean
 from ibrobot_core.app import CHECK_ESTOP, CONTROL, ESTOP, GoalRun, SessionWorker, TransportLink
 from ibrobot_zenoh.arrivals import Arrivals
+from ibrobot_zenoh.network import Reply, RosHandler, transport_of
 from ibrobot_zenoh.options import Share
 from ibrobot_zenoh.ros2 import absolute
 from ibrobot_zenoh.ros_goals import Status
-from ibrobot_zenoh.sharing import Reply, RosHandler, transport_of
 
 _ENDED_KEPT = 100
 """Number of ended goals whose results can still be asked for."""
@@ -55,8 +56,9 @@ class _Server:
 
     name: str
     type: ActionType
-    address: dict[str, str]
-    """The executor, or the service, that it is for."""
+    executor: str
+    service: str
+    """It is for one of these two."""
     goals: OrderedDict[tuple[int, ...], _Goal] = attrs.field(factory=OrderedDict)
     """Goals by their ids, the oldest first."""
 
@@ -145,14 +147,9 @@ class RosSharing(SessionWorker):
         known = fields_of(service_type(offer.type).response)
         reply({name: value for name, value in answer.items() if name in known})
 
-    def send(self, head: Mapping[str, Any]) -> None:
-        """Take what the run says of its actions and goals."""
-        takes = {"action": self._offer, "feedback": self._feed, "ended": self._conclude}
-        takes[head["op"]](head)
-
-    def _offer(self, head: Mapping[str, Any]) -> None:
-        address = {key: head[key] for key in ("executor", "service") if key in head}
-        server = _Server(head["name"], action_type(head["type"]), address)
+    def offer(self, name: str, type_name: str, *, executor: str = "", service: str = "") -> None:
+        """Serve an action of the run."""
+        server = _Server(name, action_type(type_name), executor, service)
         name, kind = f"{server.name}/_action", server.type
         self._serve(f"{name}/send_goal", kind.send_goal, partial(self._take_goal, server))
         self._serve(f"{name}/cancel_goal", kind.cancel_goal, partial(self._contain, self._cancel, server), self._way)
@@ -175,13 +172,13 @@ class RosSharing(SessionWorker):
                 return
             self._count += 1
             goal = server.goals[uuid] = self._goals[self._count] = _Goal(self._count, uuid, now_ns, server)
-        head = {"goal": goal.number, **server.address, "fields": request["goal"]}
+        asked = GoalRequest(goal.number, request["goal"], server.executor, server.service)
         try:
-            self._arrivals.check(server.address.get("service", ""), reply.sent_ns)
+            self._arrivals.check(server.service, reply.sent_ns)
         except HardwareError as error:
-            accepted = self._actions.refuse(self, head, error)
+            accepted = self._actions.refuse(self, asked, error)
         else:
-            accepted = self._actions.take_goal(self, head, stops)
+            accepted = self._actions.take_goal(self, asked, stops)
         with self._lock:
             if accepted and goal.status is Status.ACCEPTED:
                 goal.status = Status.EXECUTING
@@ -233,28 +230,29 @@ class RosSharing(SessionWorker):
         else:
             reply({"status": goal.status, "result": goal.result})
 
-    def _feed(self, head: Mapping[str, Any]) -> None:
-        goal = self._goals.get(head["goal"])
-        if goal is None or goal.result is not None:
+    def feed(self, goal: int, values: Mapping[str, Any]) -> None:
+        """Publish feedback of a goal, by its number."""
+        known = self._goals.get(goal)
+        if known is None or known.result is not None:
             return
-        server = goal.server
-        feedback = {"goal_id": {"uuid": list(goal.uuid)}, "feedback": _fields(server, head, "feedback")}
+        server = known.server
+        feedback = {"goal_id": {"uuid": list(known.uuid)}, "feedback": _fields(server, values, "feedback")}
         self._publish(f"{server.name}/_action/feedback", server.type.feedback, feedback)
 
-    def _conclude(self, head: Mapping[str, Any]) -> None:
+    def end(self, goal: int, state: str, values: Mapping[str, Any]) -> None:
+        """Answer those who wait for the result of a goal, by its number."""
         with self._lock:
-            goal = self._goals.pop(head["goal"], None)
-            if goal is None:
+            ended = self._goals.pop(goal, None)
+            if ended is None:
                 return
-            server = goal.server
-            goal.status = Status[head["state"].upper()]
-            goal.result = _fields(server, head, "result")
-            waiting, goal.waiting = goal.waiting, []
-            ended = [uuid for uuid, each in server.goals.items() if each.result is not None]
-            for uuid in ended[: max(0, len(ended) - _ENDED_KEPT)]:
+            server = ended.server
+            ended.status, ended.result = Status[state.upper()], _fields(ended.server, values, "result")
+            waiting, ended.waiting = ended.waiting, []
+            over = [uuid for uuid, each in server.goals.items() if each.result is not None]
+            for uuid in over[: max(0, len(over) - _ENDED_KEPT)]:
                 del server.goals[uuid]
         for reply in waiting:
-            reply({"status": goal.status, "result": goal.result})
+            reply({"status": ended.status, "result": ended.result})
         self._publish_status(server)
 
     def _publish_status(self, server: _Server) -> None:
@@ -269,10 +267,10 @@ class RosSharing(SessionWorker):
             self.session.log.warning("%s: %s", topic, error)
 
 
-def _fields(server: _Server, head: Mapping[str, Any], part: Literal["feedback", "result"]) -> dict[str, Any]:
+def _fields(server: _Server, values: Mapping[str, Any], part: Literal["feedback", "result"]) -> dict[str, Any]:
     """The fields of feedback or a result, without those that its type lacks."""
     known = fields_of(f"{server.type.name}_{part.capitalize()}")
-    return {name: value for name, value in head["values"].items() if name in known}
+    return {name: value for name, value in values.items() if name in known}
 
 
 def _info(goal: _Goal) -> dict[str, Any]:

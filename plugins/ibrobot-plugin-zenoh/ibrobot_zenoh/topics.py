@@ -18,6 +18,7 @@ from ibrobot_ros2.workers import Workers
 from ibrobot_core.api import Context, IbrobotError, Message, TransportError
 from ibrobot_zenoh.connection import Connection, Declared, first_line
 from ibrobot_zenoh.identity import Role, own_identity
+from ibrobot_zenoh.network import TopicTransport
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.ros2 import (
     ADMIN,
@@ -31,7 +32,6 @@ from ibrobot_zenoh.ros2 import (
     topics_of_tokens,
     type_of_key,
 )
-from ibrobot_zenoh.sharing import TopicTransport
 
 DEPTH = 100
 """Queue size of a subscriber; when it is full, the oldest message is dropped."""

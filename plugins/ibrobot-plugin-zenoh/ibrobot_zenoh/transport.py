@@ -15,12 +15,12 @@ from ibrobot_core.api import Context, Handler, Payload, TransportError
 from ibrobot_core.app import HANDLER_THREADS
 from ibrobot_zenoh.access import ANYBODY, SERVED, SERVICES, TOPICS
 from ibrobot_zenoh.connection import first_line
+from ibrobot_zenoh.network import RosHandler, Urgent, UrgentHandler
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.own_query import OwnQuery, Query, attachment_of
 from ibrobot_zenoh.presence import Presence
 from ibrobot_zenoh.ros2 import sent_of, service_key
 from ibrobot_zenoh.ros_calls import RosServer, call, sent_now
-from ibrobot_zenoh.sharing import RosHandler, Urgent, UrgentHandler
 from ibrobot_zenoh.topics import RosTransport
 
 SUBSCRIBER_DEPTH = 1000

@@ -19,9 +19,9 @@ from ibrobot_ros2.workers import StopWay
 from ibrobot_testing import stand_in
 from ibrobot_testing.section import make_session
 from ibrobot_zenoh import ros_calls
+from ibrobot_zenoh.network import Reply
 from ibrobot_zenoh.ros2 import actions_of, attachment, service_key
 from ibrobot_zenoh.ros_goals import SentGoal, Status
-from ibrobot_zenoh.sharing import Reply
 from ibrobot_zenoh.transport import ZenohTransport
 
 from ibrobot_core.api import NS_PER_S, IbrobotError, Payload

@@ -15,8 +15,8 @@ import pytest
 import zenoh
 from ibrobot_ros2 import CodecError
 from ibrobot_ros2.interfaces import service_type
+from ibrobot_zenoh.network import Reply
 from ibrobot_zenoh.ros2 import Node, SharedService, caller_of, service_key, services_of_tokens
-from ibrobot_zenoh.sharing import Reply
 from ibrobot_zenoh.transport import ZenohTransport
 
 from ibrobot_core.api import TransportError

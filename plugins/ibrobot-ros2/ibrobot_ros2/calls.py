@@ -1,6 +1,6 @@
 """Services of a run that take their time, as actions of ROS: the request is the goal, and the answer is the result.
 
-Goals and heads are as in `goals`; their key `service` is the service.
+They are offered, fed and ended as those of executors, see `goals`.
 """
 
 from __future__ import annotations
@@ -23,10 +23,27 @@ _END_S = 5.0
 
 
 class Wire(Protocol):
-    """Passes heads to clients. `op` is `action` (an action is offered), `feedback` or `ended`."""
+    """Speaks to clients of actions."""
 
-    def send(self, head: Mapping[str, Any]) -> object:
-        """Pass one on."""
+    def offer(self, name: str, type_name: str, *, executor: str = "", service: str = "") -> None:
+        """Offer an action of an executor, or of a service."""
+
+    def feed(self, goal: int, values: Mapping[str, Any]) -> None:
+        """Send feedback of a goal, by its number."""
+
+    def end(self, goal: int, state: str, values: Mapping[str, Any]) -> None:
+        """Send the result of a goal: `succeeded`, `aborted` or `canceled`."""
+
+
+@attrs.frozen
+class GoalRequest:
+    """A goal of a client."""
+
+    number: int
+    fields: Mapping[str, Any]
+    executor: str = ""
+    service: str = ""
+    """It is for one of these two."""
 
 
 @attrs.define(eq=False)
@@ -80,28 +97,28 @@ class Calls:
         for name, service in self._session.bus.services().items():
             if is_action(service) and name not in self._declared and self._is_offered(name):
                 self._declared.add(name)
-                wire.send({"op": "action", "name": self._named(name), "type": service.ros_type, "service": name})
+                wire.offer(self._named(name), service.ros_type, service=name)
 
-    def take_goal(self, wire: Wire, head: Mapping[str, Any]) -> bool:
+    def take_goal(self, wire: Wire, request: GoalRequest) -> bool:
         """Call a service, in a thread of its own; returns whether the goal is accepted."""
-        number, service = head["goal"], self._session.bus.services().get(head["service"])
+        number, service = request.number, self._session.bus.services().get(request.service)
         with self._lock:
             goal = _Goal(wire, number, service) if service is not None and len(self._goals) < _MOST else None
             if goal is not None:
                 self._goals[wire, number] = goal
         if goal is None:
             why = f"{_MOST} goals are under way" if service is not None else "nobody serves it now"
-            self._session.log.warning("%s: goal for %s rejected: %s", self._who, head["service"], why)
+            self._session.log.warning("%s: goal for %s rejected: %s", self._who, request.service, why)
             return False
-        self._start(self._call, goal, with_ns(head["fields"]))
+        self._start(self._call, goal, with_ns(request.fields))
         if goal.service.progress is not None:
             self._start(self._report, goal, goal.service.progress)
         return True
 
-    def refuse(self, wire: Wire, head: Mapping[str, Any], error: IbrobotError) -> bool:
+    def refuse(self, wire: Wire, request: GoalRequest, error: IbrobotError) -> bool:
         """Accept a goal only to say why it is refused."""
         self._session.log.warning("%s: %s", self._who, error)
-        wire.send({"op": "ended", "goal": head["goal"], "state": "aborted", "values": refused(error)})
+        wire.end(request.number, "aborted", refused(error))
         return True
 
     def cancel(self, wire: Wire, number: int) -> bool:
@@ -144,7 +161,7 @@ class Calls:
             goal.ended.set()
             if goal.canceled:
                 state = "canceled"
-        goal.wire.send({"op": "ended", "goal": goal.number, "state": state, "values": values})
+        goal.wire.end(goal.number, state, values)
 
     def _report(self, goal: _Goal, progress: Service[Any, Any]) -> None:
         """Send feedback until the call has ended."""
@@ -153,4 +170,4 @@ class Calls:
                 values = plain(self._session.bus.call(progress))
             except IbrobotError:  # it ends just now
                 return
-            goal.wire.send({"op": "feedback", "goal": goal.number, "values": values})
+            goal.wire.feed(goal.number, values)

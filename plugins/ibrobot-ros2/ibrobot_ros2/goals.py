@@ -31,7 +31,7 @@ from ibrobot_core.api import (
     seconds,
 )
 from ibrobot_core.app import ControlState, ExecutorConfig, GoalRun, PlanCode
-from ibrobot_ros2.calls import Calls, Wire
+from ibrobot_ros2.calls import Calls, GoalRequest, Wire
 from ibrobot_ros2.inference import serve_chunks
 from ibrobot_ros2.offers import time_of, with_ns
 
@@ -145,39 +145,36 @@ class Actions:
         self._node += 1
         for executor in self._executors.values():
             name, type_name = action_of(executor, self._gripper_action)
-            wire.send({"op": "action", "name": self._named(name), "type": type_name, "executor": executor.name})
+            wire.offer(self._named(name), type_name, executor=executor.name)
         self._calls.declare(wire)
 
     def refresh(self, wire: Wire) -> None:
         """Tell the node which actions are new."""
         self._calls.refresh(wire)
 
-    def take_goal(self, wire: Wire, head: Mapping[str, Any], stops: int) -> bool:
-        """Take a goal, which was received after `stops` emergency stops; returns whether it is accepted.
-
-        The keys of `head` are `goal`, its number, `executor` or `service`, and `fields`.
-        """
-        if "service" in head:
-            return self._calls.take_goal(wire, head)
-        executor = self._executors[head["executor"]]
-        name = self._name(head["goal"])
+    def take_goal(self, wire: Wire, request: GoalRequest, stops: int) -> bool:
+        """Take a goal, which was received after `stops` emergency stops; returns whether it is accepted."""
+        if request.service:
+            return self._calls.take_goal(wire, request)
+        executor = self._executors[request.executor]
+        name = self._name(request.number)
         now_ns = self._session.clock.now_ns()
         with self._lock:
-            self._goals[name] = _Goal(head["goal"], executor.name, now_ns, now_ns)
+            self._goals[name] = _Goal(request.number, executor.name, now_ns, now_ns)
         try:
-            goal = self._read(executor, with_ns(head["fields"]))
+            goal = self._read(executor, with_ns(request.fields))
             self._session.send_goal(executor.name, name, goal, stops)
         except IbrobotError as error:
             with self._lock:
                 self._goals.pop(name, None)
-            return self.refuse(wire, head, error)
+            return self.refuse(wire, request, error)
         return True
 
-    def refuse(self, wire: Wire, head: Mapping[str, Any], error: IbrobotError) -> bool:
+    def refuse(self, wire: Wire, request: GoalRequest, error: IbrobotError) -> bool:
         """Say why a goal is refused; returns whether it was accepted, only to say so."""
-        if "service" in head:
-            return self._calls.refuse(wire, head, error)
-        number, executor = head["goal"], self._executors[head["executor"]]
+        if request.service:
+            return self._calls.refuse(wire, request, error)
+        executor = self._executors[request.executor]
         code = error.code if isinstance(error, _Invalid) else TrajectoryCode.INVALID_GOAL
         if isinstance(error, PlanningError) and error.code is PlanCode.INVALID_GROUP_NAME:
             code = TrajectoryCode.INVALID_JOINTS
@@ -192,7 +189,7 @@ class Actions:
         if executor.goals != "trajectory":
             return False
         values = {"error_code": int(code), "error_string": str(error)}
-        wire.send({"op": "ended", "goal": number, "state": "aborted", "values": values})
+        wire.end(request.number, "aborted", values)
         return True
 
     def cancel(self, wire: Wire, number: int) -> bool:
@@ -241,7 +238,7 @@ class Actions:
         else:
             values = self._gripper(goal.executor, self._session.measured())
             values |= {key: bool(result[key]) for key in ("stalled", "reached_goal") if key in result}
-        self._wire.send({"op": "ended", "goal": goal.number, "state": state, "values": values})
+        self._wire.end(goal.number, state, values)
 
     def _take_state(self, state: ControlState) -> None:
         """Send feedback of the goals under way."""
@@ -252,7 +249,7 @@ class Actions:
             follows = self._executors[goal.executor].goals == "trajectory"
             values = self._motion(goal, state) if follows else self._gripper(goal.executor, state)
             assert self._wire is not None
-            self._wire.send({"op": "feedback", "goal": goal.number, "values": values})
+            self._wire.feed(goal.number, values)
 
     def _motion(self, goal: _Goal, state: ControlState) -> dict[str, Any]:
         """Feedback of FollowJointTrajectory."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import attrs
 import pytest
-from ibrobot_ros2.calls import Calls
+from ibrobot_ros2.calls import Calls, GoalRequest
 from ibrobot_testing.section import make_session
 
 from ibrobot_core.api import RecorderError
@@ -46,9 +46,18 @@ class Client:
         self.heads: list[Any] = []
         self.changed = threading.Condition()
 
-    def send(self, head: Any) -> None:
+    def offer(self, name: str, type_name: str, *, executor: str = "", service: str = "") -> None:
+        self._note("action", name=name, type=type_name, service=service)
+
+    def feed(self, goal: int, values: Mapping[str, Any]) -> None:
+        self._note("feedback", values=values)
+
+    def end(self, goal: int, state: str, values: Mapping[str, Any]) -> None:
+        self._note("ended", state=state, values=values)
+
+    def _note(self, op: str, **head: Any) -> None:
         with self.changed:
-            self.heads.append(dict(head))
+            self.heads.append({"op": op, **head})
             self.changed.notify_all()
 
     def take(self, op: str) -> dict[str, Any]:
@@ -83,7 +92,7 @@ class Robot:
         return self.answer
 
     def send(self, number: int = 1, fields: Mapping[str, Any] | None = None) -> bool:
-        return self.calls.take_goal(self.client, {"goal": number, "service": "/task", "fields": fields or {}})
+        return self.calls.take_goal(self.client, GoalRequest(number, fields or {}, service="/task"))
 
     def ended(self) -> tuple[str, dict[str, Any]]:
         head = self.client.take("ended")

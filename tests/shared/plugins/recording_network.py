@@ -6,8 +6,9 @@ import threading
 
 import attrs
 from ibrobot_testing.fakes import FakeTransport
+from ibrobot_zenoh.network import TopicTransport, Urgent
 from ibrobot_zenoh.options import Share
-from ibrobot_zenoh.sharing import TopicTransport, Urgent, components
+from ibrobot_zenoh.sharing import components
 
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import TransportDescriptor
