@@ -6,11 +6,13 @@ Causes are classes, see `cause`; other packages add theirs by the hook `ibrobot_
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 
 from ibrobot_core.api import Late, hookimpl
-from ibrobot_core.app import Command, Kind
+from ibrobot_core.app import Command, Kind, ReportDescriptor
 from ibrobot_diagnose.cause import KIND, CauseDescriptor
-from ibrobot_diagnose.options import CHECK_EVENTS, EVENTS
+from ibrobot_diagnose.options import CHECK_EVENTS, EVENTS, REPORT
+from ibrobot_diagnose.options import KIND as REPORT_KIND
 
 
 @hookimpl
@@ -27,3 +29,16 @@ def ibrobot_commands() -> Iterable[Command]:
     check = Late("ibrobot_diagnose.commands.check:CheckDataset")
     yield Command("datasets check", check, "Check each episode of a dataset.", CHECK_EVENTS)
     yield Command("explain", Late("ibrobot_diagnose.commands.explain:Explain"), summary, EVENTS)
+
+
+def _is_explanation(folder: Path) -> bool:
+    return (folder / REPORT).is_file()
+
+
+@hookimpl
+def ibrobot_reports() -> Iterable[ReportDescriptor]:
+    """Explanations."""
+    contents = "ibrobot_diagnose.contents"
+    yield ReportDescriptor(
+        REPORT_KIND, "Explanations", _is_explanation, Late(f"{contents}:lines_of"), Late(f"{contents}:read_contents")
+    )

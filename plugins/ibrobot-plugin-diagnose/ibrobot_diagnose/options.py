@@ -11,6 +11,10 @@ from ibrobot_provenance.work_options import on_option
 from ibrobot_core.api import option
 from ibrobot_core.app import Event, Shown
 
+KIND = "explanation"
+"""The kind of report, for pages."""
+REPORT = "explanation.json"
+
 
 def _some(instance: object, attribute: object, paths: tuple[Path, ...]) -> None:
     if not paths:
@@ -32,6 +36,9 @@ class ExplainOptions:
         None, label="Model", names="policy",
         help="ask the model again: its checkpoint's folder, or its name in the recorded YAML; `.`: the one that acted",
     )  # fmt: skip
+    out: Path | None = option(
+        None, label="Folder", suggest="explanations/{episodes}", help="folder for a report as HTML and JSON"
+    )
     ticks: bool = option(False, label=None, help="with --json, add what happened at each tick")
     jobs: int | None = option(
         None, ge=1, label="Episodes at once", more=True, help="episodes in parallel; by default one for each CPU core"
@@ -59,11 +66,13 @@ class Progress(Event):
 class Report(Event):
     """The result."""
 
+    out: str = option("", help="folder of the reports; empty without one")
     lines: tuple[str, ...] = option(help="the most probable cause of each episode")
 
     @override
     def shown(self) -> Shown:
-        return Shown("; ".join(self.lines), 1.0)
+        made = {KIND: self.out} if self.out and len(self.lines) == 1 else {}
+        return Shown("; ".join(self.lines), 1.0, made=made)
 
 
 EVENTS = (Progress, Report)

@@ -86,6 +86,10 @@ class Explanation:
         shown = "; ".join(f"{each.what} {each.change} {each.largest:.3f} rad" for each in model.effects[:12])
         return [*lines, f"How far its answers move: {shown}."] if shown else lines
 
+    def lines_between(self) -> list[str]:
+        """What happened between the model's answers and the arm, and how the model answers now, in words."""
+        return [*between_lines(self.window, self.course), *self._model_lines()]
+
     def lines(self) -> list[str]:
         """The explanation for a terminal."""
         diagnosis, lines = self.diagnosis, [self.first]
@@ -97,7 +101,7 @@ class Explanation:
             lines += [f"   likelihood {100 * evidence.likelihood:.0f} %{since} ({each.name})"]
             lines += [f"   {detail}" for detail in evidence.details]
             lines += [f"   What to do: {each.cause.remedy}"]
-        lines += ["", *between_lines(self.window, self.course), *self._model_lines()]
+        lines += ["", *self.lines_between()]
         if diagnosis.healthy:
             lines += [f"Tested and healthy: {'; '.join(title for _, title in diagnosis.healthy)}."]
         reasons = Counter(why for _, why in diagnosis.untested)

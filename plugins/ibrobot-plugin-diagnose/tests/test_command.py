@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 
 import pytest
@@ -11,7 +12,7 @@ import trainer
 from command_line import run_here
 from made_runs import Made, Run, metadata
 
-from ibrobot_core.api import EpisodeEnd, EpisodeStart
+from ibrobot_core.api import DatasetError, EpisodeEnd, EpisodeStart
 from ibrobot_core.app import installed_plugins
 
 pytestmark = pytest.mark.integration  # another package records the bags
@@ -144,3 +145,30 @@ def test_training_writes_the_card_beside_its_checkpoint(folder, dataset, tmp_pat
     assert card["trained"] == {"policy": "small_act", "step": 10, "steps": 10, "batch_size": 32, "dataset": "demos"}
     (explained,) = json.loads(run_here("explain", folder / "runs:1", "--data", tmp_path / "out", "--json").stdout)
     assert {"picture_dark", "checkpoint_early"} <= {each["name"] for each in explained["causes"]}
+
+
+@pytest.mark.usefixtures("fork_server")
+def test_report_is_one_page_that_needs_no_network(folder, tmp_path):
+    from ibrobot_diagnose.contents import lines_of, read_contents
+
+    done = run_here("explain", folder / "runs:1", "--data", folder / "demos", "--out", tmp_path / "one")
+    assert done.stdout.rstrip().endswith(f"report: {tmp_path / 'one' / 'report.html'}")
+    page = (tmp_path / "one" / "report.html").read_text()
+    assert page.count("<img") > 10
+    assert not re.search(r"""(?:src|href)=["']?https?:""", page)
+    assert "too dark" in page
+    assert "What to do" in page
+    sections = read_contents(tmp_path / "one")
+    assert sections[0].blocks[0].text == lines_of(tmp_path / "one")[0] == done.stdout.splitlines()[0]
+    several = run_here("explain", folder / "runs", "--out", tmp_path / "all", "--jobs", 1)
+    assert several.returncode == 0, several.stderr
+    assert len(list(tmp_path.glob("all/*/report.html"))) == 2
+
+
+def test_explanation_is_a_report_of_pages(folder, tmp_path):
+    (descriptor,) = [each for each in installed_plugins().reports if each.name == "explanation"]
+    assert not descriptor.reads(tmp_path)
+    (tmp_path / "explanation.json").write_text("[]")
+    assert descriptor.reads(tmp_path)
+    with pytest.raises(DatasetError, match=r"explanation\.json: cannot be read"):
+        descriptor.make(tmp_path)

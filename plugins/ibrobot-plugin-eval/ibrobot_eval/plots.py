@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from html import escape
-from typing import Any
 
 import attrs
+from ibrobot_provenance.svg import Axis, axis_of, caption, grid_below, grid_beside, stroke, svg, tag
 
 from ibrobot_eval.statistics import clopper_pearson
 
@@ -16,82 +15,12 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 48, 12, 8, 34
 _BINS = 5
 
 
-@attrs.frozen
-class Axis:
-    """Maps values to positions on the page [px]."""
-
-    low: float
-    high: float
-    begin: float
-    end: float
-
-    def __call__(self, value: float) -> float:
-        """The position of a value, to a tenth of a pixel."""
-        span = (self.high - self.low) or 1.0
-        return round(self.begin + (value - self.low) / span * (self.end - self.begin), 1)
-
-    def ticks(self, most: int = 6) -> list[float]:
-        """Round values along the axis."""
-        span = self.high - self.low
-        if span <= 0:
-            return [self.low]
-        step = 10.0 ** math.floor(math.log10(span / most))
-        step *= next(factor for factor in (1, 2, 5, 10) if span / (step * factor) <= most)
-        first = math.ceil(self.low / step - 1e-9)
-        return [round(step * (first + i), 10) for i in range(int((self.high - step * first) / step + 1e-9) + 1)]
-
-
-def axis_of(values: Sequence[float], begin: float, end: float) -> Axis:
-    """An axis that contains all values, with a margin."""
-    low, high = min(values), max(values)
-    room = 0.05 * (high - low) or 0.5
-    return Axis(low - room, high + room, begin, end)
-
-
-def tag(name: str, text: str = "", **attributes: Any) -> str:
-    """An SVG or HTML element; underscores in attribute names stand for hyphens."""
-    given = "".join(f' {key.rstrip("_").replace("_", "-")}="{escape(str(each))}"' for key, each in attributes.items())
-    return f"<{name}{given}>{text}</{name}>"
-
-
-def svg(width: float, height: float, parts: Sequence[str], title: str) -> str:
-    """A picture that scales with the page, with a title for screen readers."""
-    inner = tag("title", escape(title)) + "".join(parts)
-    return tag("svg", inner, viewBox=f"0 0 {width} {height}", style=f"max-width:{width}px", role="img")
-
-
 def mark(x: float, y: float, success: bool, tip: str) -> str:
     """Mark of an episode's outcome: a dot for a success, a cross for a failure."""
     if success:
         return tag("circle", tag("title", escape(tip)), cx=x, cy=y, r=3.5, class_="ok")
     path = f"M{x - 3.5:.1f},{y - 3.5:.1f}l7,7m0,-7l-7,7"
     return tag("path", tag("title", escape(tip)), d=path, class_="bad")
-
-
-def _text(x: float, y: float, text: str, anchor: str = "middle", class_: str = "") -> str:
-    return tag("text", escape(text), x=x, y=y, text_anchor=anchor, **({"class_": class_} if class_ else {}))
-
-
-def _line(x1: float, y1: float, x2: float, y2: float, class_: str) -> str:
-    return tag("line", x1=x1, y1=y1, x2=x2, y2=y2, class_=class_)
-
-
-def _below(axis: Axis, top: float, bottom: float, label: str) -> list[str]:
-    """Grid and labels of a horizontal axis."""
-    parts = []
-    for value in axis.ticks():
-        x = axis(value)
-        parts += [_line(x, top, x, bottom, "grid"), _text(x, bottom + 15, f"{value:g}")]
-    return [*parts, _text((axis.begin + axis.end) / 2, bottom + 29, label, class_="label")]
-
-
-def _beside(axis: Axis, left: float, right: float) -> list[str]:
-    """Grid and labels of a vertical axis."""
-    parts = []
-    for value in axis.ticks(5):
-        y = axis(value)
-        parts += [_line(left, y, right, y, "grid"), _text(left - 6, y + 4, f"{value:g}", "end")]
-    return parts
 
 
 def _margin(labels: Iterable[str]) -> int:
@@ -108,13 +37,13 @@ def rates(rows: Sequence[tuple[str, int, int]]) -> str:
     left = _margin(label for label, _, _ in rows)
     height = _TOP + 30 * len(rows) + _BOTTOM
     axis = Axis(0, 100, left, WIDTH - _RIGHT)
-    parts = _below(axis, _TOP, height - _BOTTOM, "success rate [%], with 95 % interval")
+    parts = grid_below(axis, _TOP, height - _BOTTOM, "success rate [%], with 95 % interval")
     for number, (label, successes, episodes) in enumerate(rows):
         y = _TOP + 30 * number + 15
         interval = clopper_pearson(successes, episodes)
         parts += [
-            _text(left - 10, y + 4, label, "end"),
-            _line(axis(100 * interval.low), y, axis(100 * interval.high), y, "range"),
+            caption(left - 10, y + 4, label, "end"),
+            stroke(axis(100 * interval.low), y, axis(100 * interval.high), y, "range"),
             mark(axis(100 * successes / episodes), y, True, f"{label}: {successes} of {episodes}"),
         ]
     return svg(WIDTH, height, parts, "Success rates with intervals")
@@ -131,12 +60,12 @@ def course(points: Sequence[tuple[int, float, float, float]], margin: float, tit
     height = 230
     across = Axis(0, max(points[-1][0], 1), _LEFT, WIDTH - _RIGHT)
     up = Axis(-100, 100, height - _BOTTOM, _TOP)
-    parts = [*_below(across, _TOP, height - _BOTTOM, "episodes"), *_beside(up, _LEFT, WIDTH - _RIGHT)]
+    parts = [*grid_below(across, _TOP, height - _BOTTOM, "episodes"), *grid_beside(up, _LEFT, WIDTH - _RIGHT)]
     upper = [f"{across(n)},{up(100 * high)}" for n, _, _, high in points]
     lower = [f"{across(n)},{up(100 * low)}" for n, _, low, _ in reversed(points)]
     parts.append(tag("polygon", points=" ".join([*upper, *lower]), class_="band"))
     for value, name in ((0.0, "zero"), (margin, "margin"), (-margin, "margin")):
-        parts.append(_line(_LEFT, up(100 * value), WIDTH - _RIGHT, up(100 * value), name))
+        parts.append(stroke(_LEFT, up(100 * value), WIDTH - _RIGHT, up(100 * value), name))
     estimate = " ".join(f"{across(n)},{up(100 * difference)}" for n, difference, _, _ in points)
     parts.append(tag("polyline", points=estimate, class_="estimate"))
     return svg(WIDTH, height, parts, title)
@@ -154,7 +83,7 @@ def strips(rows: Sequence[tuple[str, Sequence[tuple[int, bool, float, str]]]]) -
     parts = []
     for number, (label, episodes) in enumerate(rows):
         y = _TOP + 30 * number
-        parts.append(_text(left - 10, y + 16, label, "end"))
+        parts.append(caption(left - 10, y + 16, label, "end"))
         for place, (seed, success, time_s, error) in enumerate(episodes):
             broken = bool(error) and not success
             ended = f"error: {error}" if broken else f"{'success' if success else 'failure'} after {time_s:.1f} s"
@@ -165,8 +94,8 @@ def strips(rows: Sequence[tuple[str, Sequence[tuple[int, bool, float, str]]]]) -
             parts.append(tag("rect", tip, **shape, class_="ok" if success else "bad-fill"))
     first = rows[0][1][0][0]
     height = _TOP + 30 * len(rows)
-    parts.append(_text(left, height + 14, f"seed {first}", "start", "label"))
-    parts.append(_text(left + count * step, height + 14, f"{first + count - 1}", "end", "label"))
+    parts.append(caption(left, height + 14, f"seed {first}", "start", "label"))
+    parts.append(caption(left + count * step, height + 14, f"{first + count - 1}", "end", "label"))
     return svg(WIDTH, height + 20, parts, "Outcomes by seed")
 
 
@@ -180,10 +109,10 @@ def times(rows: Sequence[tuple[str, Sequence[tuple[int, float]]]]) -> str:
     times_s = [time_s for _, successes in rows for _, time_s in successes]
     axis = Axis(0, 1.05 * max(times_s), left, WIDTH - _RIGHT)
     height = _TOP + 30 * len(rows) + _BOTTOM
-    parts = _below(axis, _TOP, height - _BOTTOM, "time to success [s]")
+    parts = grid_below(axis, _TOP, height - _BOTTOM, "time to success [s]")
     for number, (label, successes) in enumerate(rows):
         y = _TOP + 30 * number + 15
-        parts.append(_text(left - 10, y + 4, label, "end"))
+        parts.append(caption(left - 10, y + 4, label, "end"))
         for seed, time_s in successes:
             tip = tag("title", f"seed {seed}: {time_s:.2f} s")
             parts.append(tag("circle", tip, cx=axis(time_s), cy=y, r=4, class_="faint"))
@@ -214,10 +143,10 @@ def _panel(across: Axis, up: Axis, names: tuple[str, str], title: str) -> list[s
     """Axes of a small plot with their names, and its title."""
     names_y = _TOP + 6
     return [
-        *_below(across, up.end, up.begin, names[0]),
-        *_beside(up, across.begin, across.end),
-        _text(across.begin - 6, names_y, names[1], "start", "label"),
-        _text(across.end, names_y, title, "end"),
+        *grid_below(across, up.end, up.begin, names[0]),
+        *grid_beside(up, across.begin, across.end),
+        caption(across.begin - 6, names_y, names[1], "start", "label"),
+        caption(across.end, names_y, title, "end"),
     ]
 
 
@@ -246,7 +175,7 @@ def by_factor(points: Sequence[tuple[float, bool]], name: str, title: str) -> st
         low, high, y = part[0][0], part[-1][0], up(100 * successes / count)
         x = across((low + high) / 2)
         interval = clopper_pearson(successes, count)
-        parts.append(_line(x, up(100 * interval.low), x, up(100 * interval.high), "range"))
-        parts.append(_line(across(low), y, across(high), y, "estimate"))
+        parts.append(stroke(x, up(100 * interval.low), x, up(100 * interval.high), "range"))
+        parts.append(stroke(across(low), y, across(high), y, "estimate"))
         parts.append(mark(x, y, True, f"{successes} of {count}"))
     return svg(width, height, parts, f"{title}: success rate over {name}")

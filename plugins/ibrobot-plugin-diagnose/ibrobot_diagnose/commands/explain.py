@@ -47,7 +47,7 @@ class Explain(ExplainOptions):
         if failed:
             raise Unsuccessful(None if emit is not None else listed)
         if emit is not None:
-            emit(Report(lines=tuple(f"{each['episode']}: {each['first']}" for each in listed)))
+            emit(Report(out=str(self.out or ""), lines=tuple(f"{each['episode']}: {each['first']}" for each in listed)))
             return None
         return listed
 
@@ -58,6 +58,8 @@ class Explain(ExplainOptions):
                 echo(f"{'' if not number else chr(10)}{each['episode']} ({each['outcome']})")
             for line in each["lines"]:
                 echo(line)
+        if self.out is not None:
+            echo(f"report: {self.out / 'report.html' if len(listed) == 1 else self.out}")
 
 
 def _explained(
@@ -97,4 +99,17 @@ def explain_episode(
         examined = examine(model_of(window, episode, "" if options.model == "." else options.model))
     reference = Reference(card, examined)
     explanation = Explanation.of(window, reference, diagnose(window, reference, tested=lambda name: progress(1)))
+    if options.out is not None:
+        from ibrobot_diagnose.contents import write_report
+
+        write_report(folder_of(options, episode), explanation, episode)
     return {**explanation.facts(ticks=options.ticks), "lines": explanation.lines()}
+
+
+def folder_of(options: ExplainOptions, episode: Path) -> Path:
+    """The folder of an episode's report: `out`, or one below it if there are several episodes."""
+    assert options.out is not None
+    if find_episodes(options.episodes) == [episode]:
+        return options.out
+    dataset = episode.parents[1].name if episode.parent.name == "episodes" else episode.parent.name
+    return options.out / f"{dataset}-{episode.name.replace(':', '-')}"

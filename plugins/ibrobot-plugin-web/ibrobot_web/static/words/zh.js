@@ -182,6 +182,7 @@ export default {
   "Train": "训练",
   "Policies": "策略",
   "Results": "结果",
+  "Explanations": "诊断",
   "Jobs": "任务进程",
   "In the opened folders": "在打开的文件夹中",
   "Shipped with ibrobot": "ibrobot 自带",
