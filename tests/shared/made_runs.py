@@ -269,6 +269,8 @@ class _Maker:
         for j, play in run.slack.items():
             target[j] = float(np.clip(self._state[j], self._command[j] - play, self._command[j] + play))
         self._state = self._state + (target - self._state) * min(1.0, 1 / CONTROL_HZ / max(run.lag_s, 0.01))
+        if t_s < self._paused_until:
+            return
         reported = run.seen(self._state + self._rng.normal(0, 0.001, len(JOINTS)))
         yield STATES, JointState(Header(START_NS + round((t_s - run.state_age_s) * 1e9)), JOINTS, reported)
         if run.takeover[1]:

@@ -46,7 +46,8 @@ def contents_of(facts: Mapping[str, Any], plots: Sequence[str], episode: Path | 
         sections.append(ReportSection(f"{number}. {cause['text']}", tuple(_blocks(cause))))
     between = [Text(line) for line in facts["lines_between"]]
     if between or plots:
-        sections.append(ReportSection("Between the answers and the arm", (*between, Plots(tuple(plots)))))
+        note = Text("Thick lines are the arm, thin ones the commands, dashed ones what the model said.", "note")
+        sections.append(ReportSection("Between the answers and the arm", (*between, note, Plots(tuple(plots)))))
     rows = tuple((each["name"], each["text"]) for each in facts["healthy"])
     if rows:
         sections.append(ReportSection(f"Tested and healthy ({len(rows)})", (Table(("cause", "what is so"), rows),)))
@@ -122,7 +123,7 @@ def _plots(explanation: Explanation) -> Iterator[str]:
         across = axis_of([float(at_s[0]), float(at_s[-1])], 44, _WIDTH - 8)
         down = axis_of([float(known.min()), float(known.max())], _HEIGHT - 36, 24)
         parts = [*grid_below(across, 24, _HEIGHT - 36, "s"), *grid_beside(down, 44, _WIDTH - 8)]
-        parts.append(caption(44, 14, f"{joint} [rad]: command (line), arm (faint), model (dashed)", "start"))
+        parts.append(caption(44, 14, f"{joint} [rad]", "start"))
         classes = {"state": "range", "command": "estimate", "answer": "margin"}
         for name, values in tracks.items():
             parts += [

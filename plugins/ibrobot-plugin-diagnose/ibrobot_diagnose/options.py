@@ -32,6 +32,10 @@ class ExplainOptions:
         None, names="dataset", label="Data",
         help="the data that the model was trained on: a dataset, its episodes, or a folder or file with their card",
     )  # fmt: skip
+    against: Path | None = option(
+        None, names="episodes", label="Against", more=True,
+        help="compare with this run, or the runs in this folder, in place of --data: what differs from one that worked",
+    )  # fmt: skip
     model: str | None = option(
         None, label="Model", names="policy",
         help="ask the model again: its checkpoint's folder, or its name in the recorded YAML; `.`: the one that acted",

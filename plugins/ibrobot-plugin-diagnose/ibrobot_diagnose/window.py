@@ -284,6 +284,8 @@ class _Reading:
         for part in contract.action_parts:
             self._command_topics.setdefault(part.topic, []).append(part)
         self._commands: list[tuple[int, int, list[float]]] = []
+        self._of_tick: set[str] = set()
+        """Topics of the commands of the present tick."""
         self._commanded = dict.fromkeys(self._joints, float("nan"))
         self._asked: list[Asked] = []
         self._commanders: list[tuple[int, str]] = []
@@ -339,11 +341,12 @@ class _Reading:
             else:
                 continue
             self._commanded |= dict(zip(part.joints, values, strict=False))
-        row = (t_ns, t_ns, list(self._commanded.values()))
-        if self._commands and self._commands[-1][0] == t_ns:  # another executor's, of the same tick
-            self._commands[-1] = row
-        else:
-            self._commands.append(row)
+        if topic in self._of_tick or not self._commands:
+            self._of_tick = {topic}
+            self._commands.append((t_ns, t_ns, list(self._commanded.values())))
+        else:  # another executor's, of the same tick
+            self._of_tick.add(topic)
+            self._commands[-1] = (*self._commands[-1][:2], list(self._commanded.values()))
 
     def _take_picture(self, camera: Camera, message: Image, t_ns: int) -> None:
         camera.times_ns.append(t_ns)

@@ -172,3 +172,12 @@ def test_explanation_is_a_report_of_pages(folder, tmp_path):
     assert descriptor.reads(tmp_path)
     with pytest.raises(DatasetError, match=r"explanation\.json: cannot be read"):
         descriptor.make(tmp_path)
+
+
+def test_run_is_compared_with_one_that_worked(folder):
+    good = record(folder / "good" / "episode_000001", Run(seed=22, seconds=4))
+    (explained,) = json.loads(run_here("explain", folder / "runs:1", "--against", good, "--json").stdout)
+    assert explained["causes"][0]["name"] == "picture_dark"
+    both = run_here("explain", folder / "runs:1", "--against", good, "--data", folder / "demos")
+    assert both.returncode == 2
+    assert "exclude each other" in both.stderr

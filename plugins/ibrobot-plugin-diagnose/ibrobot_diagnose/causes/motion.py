@@ -103,11 +103,13 @@ class StandsStill(Cause):
 
     @override
     def test(self, window: Window, reference: Reference) -> Evidence | None:
-        still = begins_to_move(window)
+        first = next(each.answer.header.stamp_ns for each in window.asked if each.used)
+        waited = max(0.0, (first - int(window.command.times_ns[0])) / 1e9)  # for the first answer
+        still = max(0.0, begins_to_move(window) - waited)
         threshold = 2.0
         if reference.card is not None:
             threshold = max(threshold, 1.5 * reference.card.quantile("idle_start_s", 0.95))
-        whole = still >= window.seconds - 1e-6
+        whole = still + waited >= window.seconds - 0.1
         text = (
             f"The policy never moved the arm in {window.seconds:.1f} s."
             if whole

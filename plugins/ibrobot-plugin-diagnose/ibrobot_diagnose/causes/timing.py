@@ -153,7 +153,7 @@ class TicksMissed(Cause):
 
     name = "ticks_missed"
     title = "the control loop keeps its ticks"
-    needs = frozenset({"commands"})
+    needs = frozenset({"commands", "state"})
     explains = frozenset({"arm_not_following"})
     remedy = (
         "Give the control process its core: see the page on real-time permissions, close what loads the machine, and "
@@ -162,7 +162,7 @@ class TicksMissed(Cause):
 
     @override
     def test(self, window: Window, reference: Reference) -> Evidence | None:
-        times = window.command.times_ns
+        times = np.unique(window.state.stamps_ns)  # of the control process; receipt also waits for the recorder
         if window.sampled or len(times) < 20:
             return None
         gaps = np.diff(times)
@@ -176,7 +176,7 @@ class TicksMissed(Cause):
             return None
         text = (
             f"The control loop missed {100 * share:.1f} % of its ticks: {int(long.sum())} pauses, the longest "
-            f"{gaps.max() / 1e6:.0f} ms with {usual / 1e6:.0f} ms between commands."
+            f"{gaps.max() / 1e6:.0f} ms with {usual / 1e6:.0f} ms between its states."
         )
         since = window.since(int(times[:-1][long][0]))
         return Evidence(text, 100 * share, "%", 3.0, likelihood(share, 0.03, 0.12), since)

@@ -11,7 +11,7 @@ import attrs
 from ibrobot_provenance.jobs import Job, open_pool
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import Emit, Unsuccessful, echo, wrong_input
+from ibrobot_core.app import Emit, RequestError, Unsuccessful, echo, wrong_input
 from ibrobot_diagnose.options import ExplainOptions, Progress, Report
 from ibrobot_diagnose.references import card_of, find_episodes, read_episode
 
@@ -31,7 +31,10 @@ class Explain(ExplainOptions):
     @wrong_input()
     def __call__(self, emit: Emit) -> list[dict[str, Any]] | None:
         episodes = find_episodes(self.episodes)
-        card = card_of(self.data) if self.data is not None else None
+        if self.data is not None and self.against is not None:
+            raise RequestError("--data and --against exclude each other: a run is compared with one of them")
+        data = self.data or self.against
+        card = card_of(data) if data is not None else None
         results: dict[Path, dict[str, Any]] = {}
         failed = []
         for number, (episode, result, error) in enumerate(_explained(self, episodes, card), 1):
