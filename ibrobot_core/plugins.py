@@ -391,7 +391,7 @@ class _Plugin:
         self.manager.register(loaded, self.name)
         self.stage = "ibrobot_kinds"
         for kind in _offered(self.manager, self.stage):
-            if kind.name in KINDS or registry.kinds.setdefault(kind.name, kind) is not kind:
+            if kind.name in KINDS or registry.kinds.setdefault(kind.name, kind) != kind:
                 self.refuse(registry, f"kind {kind.name!r} is defined by another package already")
 
     def offer(self, registry: Registry) -> None:

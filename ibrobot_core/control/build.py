@@ -36,6 +36,7 @@ def build_core(config: RobotConfig, registry: Registry, clock: Clock, seed: int)
     else:
         problem = "neither hardware nor simulation is there: nothing to control"
         raise ConfigError([Problem(str(config.source), 0, "hardware", problem)])
-    guard = config.control.guard and make("guard", config.control.guard, "guard", config.robot.joint_names)
+    named = config.control.guard
+    guard = None if named is None else make("guard", named, "guard", config.robot.joint_names)
     group = HardwareGroup(config.robot, hardware, config.control.state_timeout)
     return ControlCore(config, group, executors, clock, guard)

@@ -28,7 +28,11 @@ class TeleopCommand:
     """The operator's command at one instant."""
 
     positions: Mapping[str, float] | None
-    """Joint name -> position [rad]; None while the deadman is released, so that the robot holds."""
+    """Joint name -> position [rad]; None while the deadman is released, so that the robot holds.
+
+    Of an executor's joints all or none: if one is missing, the others hold, too. A joint that should rest is commanded
+    to where it was at `activate`.
+    """
     estop: bool = False
     approaching: bool = False
     """Whether the robot still moves to the device's own pose, and follows it only then."""

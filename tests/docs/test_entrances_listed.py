@@ -110,8 +110,8 @@ COMMANDS = {
     **dict.fromkeys(
         (
             "camera", "certs", "config", "config copy", "config import", "config new", "config schema", "contract",
-            "convert", "datasets", "datasets check", "datasets info", "description", "doctor", "episodes", "episodes delete",
-            "episodes list",
+            "convert", "datasets", "datasets check", "datasets info", "description", "doctor", "episodes",
+            "episodes delete", "episodes list",
             "episodes mark", "episodes repair", "episodes trash", "episodes trim", "explain", "export", "feetech",
             "gamepad",
             "lerobot", "plan", "plugins", "serve", "train",
@@ -175,7 +175,7 @@ def unknown(found: set[str], *known: set[str] | dict[str, str]) -> list[str]:
 
 def test_types_of_plugins_have_rows() -> None:
     found = {f"{KINDS[descriptor]} {first(call, 'type')}" for descriptor in KINDS for _, call in calls(descriptor)}
-    assert unknown(found, NAMED) == []
+    assert unknown(found, NAMED) == [], "add a row to the table of entrances in docs/explanation/safety.md"
     rows = {name for name in NAMED if name.split()[0] in KINDS.values()}
     assert unknown(rows, found) == [], "there is no such type"
 

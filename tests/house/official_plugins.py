@@ -60,7 +60,7 @@ def offers() -> dict[str, dict[str, list[str]]]:
         if jobs := [name for name in commands if registry.commands[name].events]:
             kinds["job"] = jobs
         if kinds:
-            found[package] = kinds
+            found[package] = dict(sorted(kinds.items()))
     return dict(sorted(found.items()))
 
 

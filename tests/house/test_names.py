@@ -79,4 +79,4 @@ def test_plugins_that_are_not_installed_are_named() -> None:
     from official_plugins import missing
 
     assert missing(set(official_plugins()) - {"ibrobot-plugin-ray"}) == ["ibrobot-plugin-ray"]
-    assert missing(official_plugins()) == []
+    assert missing(official_plugins()) == [], "run python tests/house/official_plugins.py"

@@ -307,7 +307,7 @@ class _Maker:
             shown = run.picture(camera, draw(camera, true, run.seed, self._rng, run.moved.get(camera, _STILL)), t_s)
             header = Header(START_NS + round((t_s - run.picture_age_s) * 1e9))
             topic = f"/{run.cameras[run.cameras.index(camera) - 1] if run.exchanged else camera}"
-            yield topic, Image(header, *shown.shape[:2], "rgb8", shown.shape[1] * 3, shown.ravel())
+            yield topic, Image(header, shown.shape[0], shown.shape[1], "rgb8", shown.shape[1] * 3, shown.ravel())
 
 
 def _blend(plan: Any, counts: Any, begin: int, actions: Any, observed: int, step: int) -> tuple[Any, Any, int]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from operator import mul
 from typing import Any
 
 import numpy as np
@@ -45,7 +47,7 @@ def blurred(times: int) -> Change:
         values = picture.astype(np.float32)
         for _ in range(times):
             around = [np.roll(values, step, axis) for step in (1, -1) for axis in (0, 1)]
-            values = (values + sum(around)) / 5
+            values = ((values + np.sum(around, axis=0)) / 5).astype(np.float32)
         return values.astype(np.uint8)
 
     return of_top(change)
@@ -81,12 +83,17 @@ def _same(options: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any], dict
     return options, options, options
 
 
+def in_order(*order: int) -> Callable[[Pixels], Pixels]:
+    """Joints in another order."""
+    return lambda state: state[list(order)]
+
+
 def of_gripper(change: Callable[[float], float]) -> Callable[[Pixels], Pixels]:
     """A change of what the robot reports of its gripper."""
     return lambda state: np.array([*state[:3], change(float(state[3]))])
 
 
-PICTURES = {
+PICTURES: dict[str, tuple[dict[str, Any], ...]] = {
     "picture_dark": tuple({"picture": scaled(each)} for each in (0.65, 0.5, 0.25)),
     "picture_bright": tuple({"picture": scaled(each)} for each in (1.4, 1.6, 1.9)),
     "picture_blurred": tuple({"picture": blurred(each)} for each in (1, 3, 8)),
@@ -99,15 +106,13 @@ PICTURES = {
     "camera_moved": tuple({"moved": {"top": each}} for each in ((2, 1, 0.0), (5, 2, 0.03), (12, 6, 0.1))),
 }
 """Likewise, found with a card of the data, from pictures."""
-JOINTS = {
+JOINTS: dict[str, tuple[dict[str, Any], ...]] = {
     "joint_zero": tuple({"zero": {0: each}, "start": (each, 0, 0, 0)} for each in (0.25, 0.35, 0.45)),
     "unseen_start": tuple({"start": (0, each, 0, 0)} for each in (0.25, 0.4, 0.8)),
     "other_units": _same({"seen": lambda state: state * 180 / np.pi}),
-    "joint_order": tuple(
-        {"seen": lambda state, order=each: state[order]} for each in ([1, 0, 2, 3], [2, 1, 0, 3], [0, 2, 1, 3])
-    ),
+    "joint_order": tuple({"seen": in_order(*each)} for each in ((1, 0, 2, 3), (2, 1, 0, 3), (0, 2, 1, 3))),
     "gripper_reversed": _same({"seen": of_gripper(lambda angle: 1.3 - angle)}),
-    "gripper_scaled": tuple({"seen": of_gripper(lambda angle, by=each: by * angle)} for each in (1.8, 2.5, 3.5)),
+    "gripper_scaled": tuple({"seen": of_gripper(partial(mul, each))} for each in (1.8, 2.5, 3.5)),
     "other_speed": tuple({"speed": each} for each in (1.7, 2.0, 3.0)),
     "other_prompt": tuple(
         {"prompt": each} for each in ("Pick up the cube.", "pick up the blue ball", "wipe the table")

@@ -64,7 +64,8 @@ def picture(pose: tuple[float, ...], size: tuple[int, int] = SIZE) -> np.ndarray
     met = (origin + directions * (-origin[2] / directions[:, 2])[:, None]) / (BOARD.square / 1000) * dots
     at = met[:, :2] + np.array([BOARD.columns, BOARD.rows]) * dots / 2 + dots - 0.5
     places = at.reshape(size[1], size[0], 2).astype(np.float32)
-    seen = cv2.remap(board, places, None, cv2.INTER_AREA, borderMode=cv2.BORDER_CONSTANT, borderValue=90)
+    flat = np.empty(0, np.float32)  # the second map, which is in the first
+    seen = cv2.remap(board, places, flat, cv2.INTER_AREA, borderMode=cv2.BORDER_CONSTANT, borderValue=90)
     return np.asarray(cv2.GaussianBlur(seen, (3, 3), 0.7), np.uint8)
 
 
@@ -126,7 +127,8 @@ def test_the_file_is_what_a_camera_reads(tmp_path: Path) -> None:
 
 def test_a_view_that_does_not_fit_is_left_out_and_named() -> None:
     views = made()
-    bent = attrs.evolve(views[3], corners=views[3].corners + np.float32([6, 0]) * (views[3].points[:, :1] > 0.1))
+    moved = np.where(views[3].points[:, :1] > 0.1, 6.0, 0.0) * np.array([1.0, 0.0])
+    bent = attrs.evolve(views[3], corners=(views[3].corners + moved).astype(np.float32))
     result = solve([*views[:3], bent, *views[4:]])
     assert list(result.dropped) == ["view 3"]
     assert "left out: view 3" in "\n".join(result.lines())

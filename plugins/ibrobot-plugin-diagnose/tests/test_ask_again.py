@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+from importlib.util import find_spec
 
 import pytest
 from command_line import run_here
 
-pytestmark = pytest.mark.integration  # a simulation, its policy and a recorder
+pytestmark = [
+    pytest.mark.integration,  # a simulation, its policy and a recorder
+    pytest.mark.skipif(find_spec("ibrobot_mujoco") is None, reason="needs ibrobot-plugin-mujoco"),
+]
 
 
 @pytest.fixture(scope="module")

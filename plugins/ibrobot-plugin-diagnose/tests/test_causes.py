@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import Any
 
 import pytest
 from ibrobot_diagnose.card import make_card
@@ -28,7 +29,7 @@ def first_of(run: Run, reference: Reference) -> str:
 
 @pytest.mark.parametrize("cause", TIMES)
 def test_planted_fault_is_named_first(cause):
-    counts = Counter()
+    counts = Counter[str]()
     for strength, options in zip(STRENGTHS, TIMES[cause], strict=True):
         for seed in SEEDS:
             run = Run(seed=seed, cameras=(), outcome="failure", **options)
@@ -37,12 +38,12 @@ def test_planted_fault_is_named_first(cause):
     assert min(counts["medium"], counts["mild"]) >= 2
 
 
-@pytest.mark.parametrize("cause", {**PICTURES, **JOINTS})
+@pytest.mark.parametrize("cause", [*PICTURES, *JOINTS])
 def test_planted_fault_is_named_first_with_the_data(cause, data):
-    options = {**PICTURES, **JOINTS}[cause]
+    planted: dict[str, tuple[dict[str, Any], ...]] = PICTURES | JOINTS
     named = [
         first_of(Run(seed=9010 + number, seconds=6, outcome="failure", **each), data)
-        for number, each in enumerate(options)
+        for number, each in enumerate(planted[cause])
     ]
     assert named[1:] == [cause] * 2
     assert named[0] in (cause, ""), "a mild fault may be missed, but accuses no other cause"

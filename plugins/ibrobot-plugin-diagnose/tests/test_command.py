@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+from importlib.util import find_spec
 
 import pytest
 import trainer
@@ -13,9 +14,12 @@ from command_line import run_here
 from made_runs import Made, Run, metadata
 
 from ibrobot_core.api import DatasetError, EpisodeEnd, EpisodeStart
-from ibrobot_core.app import installed_plugins
+from ibrobot_core.app import Text, installed_plugins
 
-pytestmark = pytest.mark.integration  # another package records the bags
+pytestmark = [
+    pytest.mark.integration,  # another package records the bags
+    pytest.mark.skipif(find_spec("ibrobot_mcap") is None, reason="needs ibrobot-plugin-mcap"),
+]
 
 
 def record(folder, run):
@@ -159,7 +163,9 @@ def test_report_is_one_page_that_needs_no_network(folder, tmp_path):
     assert "too dark" in page
     assert "What to do" in page
     sections = read_contents(tmp_path / "one")
-    assert sections[0].blocks[0].text == lines_of(tmp_path / "one")[0] == done.stdout.splitlines()[0]
+    first = sections[0].blocks[0]
+    assert isinstance(first, Text)
+    assert first.text == lines_of(tmp_path / "one")[0] == done.stdout.splitlines()[0]
     several = run_here("explain", folder / "runs", "--out", tmp_path / "all", "--jobs", 1)
     assert several.returncode == 0, several.stderr
     assert len(list(tmp_path.glob("all/*/report.html"))) == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from ibrobot_diagnose.cause import Reference, diagnose
 from made_runs import Run, window_of
 from planted_faults import frozen, of_top, scaled
 
-PLANTED = {
+PLANTED: dict[str, Any] = {
     "idle_start": {"idle_s": 3.0, "seconds": 9.5},
     "idle_end": {"seconds": 12.0},
     "stall": {"stall": (2.5, 3.0), "seconds": 10.0},

@@ -280,7 +280,7 @@ def test_joints_that_stray_from_their_path_widen_the_margin(tmp_path) -> None:
 
 
 def make_change(kind: str) -> WorldObject:
-    shape = {
+    shape: Any = {
         "box": Box((0.1, 0.2, 0.3)),
         "sphere": Sphere(0.1),
         "plane": Plane(),

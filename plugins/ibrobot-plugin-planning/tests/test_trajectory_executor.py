@@ -325,7 +325,7 @@ def test_cancelling_holds_the_measured_position() -> None:
     assert arm.statuses() == []
 
 
-def quintic(time_s: float, positions: Any) -> dict[str, Any]:
+def quintic(time_s: float, positions: Any) -> JointTrajectoryPoint:
     return point(time_s, positions, (0.0, 0.0), (0.0, 0.0))
 
 

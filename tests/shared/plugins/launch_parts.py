@@ -25,6 +25,7 @@ from ibrobot_core.descriptors import (
     ExecutorDescriptor,
     HardwareDescriptor,
     Kind,
+    Late,
     PolicyDescriptor,
     RecorderDescriptor,
     SensorDescriptor,
@@ -42,13 +43,13 @@ TROUBLE: dict[str, str] = {}
 
 try:
     from ibrobot_planning.planner import PlannerDescriptor
-except ImportError:  # then this plugin defines the kind
-
-    @hookimpl
-    def ibrobot_kinds():
-        yield Kind("planner", "ibrobot_planners", Descriptor)
-
+except ImportError:  # any class of descriptors will do
     PlannerDescriptor = Descriptor  # type: ignore[assignment, misc]
+
+
+@hookimpl
+def ibrobot_kinds():
+    yield Kind("planner", "ibrobot_planners", PlannerDescriptor)
 
 
 class Scene(FakeHardware):
@@ -246,7 +247,7 @@ def ibrobot_sources():
 
 @hookimpl
 def ibrobot_planners():
-    yield PlannerDescriptor("cubic", lambda options, ctx: None, "cubics")
+    yield PlannerDescriptor("cubic", Late("nowhere:Cubic"), "cubics")
 
 
 @hookimpl

@@ -20,6 +20,6 @@ def ibrobot_hardware() -> Iterator[HardwareDescriptor]:
 
 @hookimpl
 def ibrobot_jugdes() -> Iterator[Descriptor[Any]]:
-    from fake_defining import JudgeDescriptor
+    from fake_defining import JudgeDescriptor  # type: ignore[import-not-found]
 
     yield JudgeDescriptor("mild", unused, "never pleased")

@@ -20,6 +20,6 @@ def ibrobot_hardware() -> Iterator[HardwareDescriptor]:
 
 @hookimpl(optionalhook=True)
 def ibrobot_judges() -> Iterator[Descriptor[Any]]:
-    from fake_defining import JudgeDescriptor
+    from fake_defining import JudgeDescriptor  # type: ignore[import-not-found]
 
     yield JudgeDescriptor("strict", unused, "never pleased")

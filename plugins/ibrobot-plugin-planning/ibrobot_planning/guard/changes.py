@@ -106,7 +106,8 @@ def _read_shape(values: list[Any]) -> Shape:
     if kind == "voxels":
         size, cells = rest
         return Voxels(float(size), _array(cells, "<i8"))
-    return SIMPLE[kind](*rest)
+    simple: Shape = SIMPLE[kind](*rest)
+    return simple
 
 
 def _text(array: np.ndarray[Any, Any], kind: str) -> str:

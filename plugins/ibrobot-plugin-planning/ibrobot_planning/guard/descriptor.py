@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import attrs
 
 from ibrobot_core.api import Descriptor
 
-if TYPE_CHECKING:
-    pass
-
 
 @attrs.frozen
-class GuardDescriptor(Descriptor["Guard"]):
+class GuardDescriptor(Descriptor[Any]):
     """A guard, the section `control.guard`; it is made in the control process."""
