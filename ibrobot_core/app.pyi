@@ -8,7 +8,6 @@ from ibrobot_core.descriptors import (
     SourceDescriptor as SourceDescriptor,
     PanelDescriptor as PanelDescriptor,
     GuideDescriptor as GuideDescriptor,
-    ReportDescriptor as ReportDescriptor,
     ConfigFile as ConfigFile,
     FeatureDescriptor as FeatureDescriptor,
 )
@@ -165,17 +164,6 @@ from ibrobot_core.signals import on_signals as on_signals, end_signals as end_si
 
 # Guides
 from ibrobot_core.interfaces import Guide as Guide, Question as Question
-
-# Reports
-from ibrobot_core.reports import (
-    ReportSection as ReportSection,
-    Text as Text,
-    Table as Table,
-    Plots as Plots,
-    Cases as Cases,
-    Case as Case,
-    PLOT_CLASSES as PLOT_CLASSES,
-)
 
 # Processes
 from ibrobot_core.channel import Channel as Channel, ChannelMessage as ChannelMessage

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from ibrobot_core.events import Event
     from ibrobot_core.interfaces.run import RunAccess, RunView
     from ibrobot_core.messages import CompressedImage, Image
-    from ibrobot_core.reports import ReportSection
     from ibrobot_core.robot import Robot
     from ibrobot_core.schema import RobotConfig
     from ibrobot_core.selection import JointFeature
@@ -365,22 +364,6 @@ class GuideDescriptor:
     """Does the work in a process of its own, with the answers to the questions by name."""
     questions: Callable[[], Sequence[interfaces.Question]] = lambda: ()
     """Returns the questions that are asked first, e.g. for the port, with what is plugged in as choices."""
-
-
-@attrs.frozen
-class ReportDescriptor:
-    """Folders with results that pages list, and show as a report."""
-
-    name: str
-    """Kind of the report, as in `Shown.made`, e.g. `evaluation`."""
-    title: str
-    """Title of the page's view, e.g. `Evaluations`."""
-    reads: Callable[[Path], bool]
-    """Returns whether a folder is one, by the names of its files."""
-    lines: Callable[[Path], Sequence[str]]
-    """Returns the result of a folder in a few lines; raises IbrobotError."""
-    make: Callable[[Path], Sequence[ReportSection]]
-    """Returns the report on a folder; raises IbrobotError."""
 
 
 @attrs.frozen

@@ -115,11 +115,6 @@ def ibrobot_guides() -> Iterable[descriptors.GuideDescriptor]:  # type: ignore[e
 
 
 @hookspec
-def ibrobot_reports() -> Iterable[descriptors.ReportDescriptor]:  # type: ignore[empty-body]
-    """Folders with results, which pages list and show."""
-
-
-@hookspec
 def ibrobot_kinds() -> Iterable[descriptors.Kind]:  # type: ignore[empty-body]
     """Kinds that this plugin defines, each with a hook by which others offer theirs."""
 

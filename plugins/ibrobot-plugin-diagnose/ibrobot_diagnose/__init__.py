@@ -8,8 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+from ibrobot_provenance.reports import ReportDescriptor
+
 from ibrobot_core.api import Late, hookimpl
-from ibrobot_core.app import Command, Kind, ReportDescriptor
+from ibrobot_core.app import Command, Kind
 from ibrobot_diagnose.cause import KIND, CauseDescriptor
 from ibrobot_diagnose.options import CHECK_EVENTS, EVENTS, REPORT
 from ibrobot_diagnose.options import KIND as REPORT_KIND
@@ -40,5 +42,10 @@ def ibrobot_reports() -> Iterable[ReportDescriptor]:
     """Explanations."""
     contents = "ibrobot_diagnose.contents"
     yield ReportDescriptor(
-        REPORT_KIND, "Explanations", _is_explanation, Late(f"{contents}:lines_of"), Late(f"{contents}:read_contents")
+        REPORT_KIND,
+        summary="Why runs of a policy failed.",
+        label="Explanations",
+        reads=_is_explanation,
+        lines=Late(f"{contents}:lines_of"),
+        make=Late(f"{contents}:read_contents"),
     )

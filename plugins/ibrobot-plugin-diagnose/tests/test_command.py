@@ -11,10 +11,11 @@ from importlib.util import find_spec
 import pytest
 import trainer
 from command_line import run_here
+from ibrobot_provenance.reports import ReportDescriptor, Text
 from made_runs import Made, Run, metadata
 
 from ibrobot_core.api import DatasetError, EpisodeEnd, EpisodeStart
-from ibrobot_core.app import Text, installed_plugins
+from ibrobot_core.app import installed_plugins
 
 pytestmark = [
     pytest.mark.integration,  # another package records the bags
@@ -172,7 +173,8 @@ def test_report_is_one_page_that_needs_no_network(folder, tmp_path):
 
 
 def test_explanation_is_a_report_of_pages(folder, tmp_path):
-    (descriptor,) = [each for each in installed_plugins().reports if each.name == "explanation"]
+    descriptor = installed_plugins().find("report", "explanation")
+    assert isinstance(descriptor, ReportDescriptor)
     assert not descriptor.reads(tmp_path)
     (tmp_path / "explanation.json").write_text("[]")
     assert descriptor.reads(tmp_path)

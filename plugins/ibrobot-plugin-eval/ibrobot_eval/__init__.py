@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+from ibrobot_provenance.reports import ReportDescriptor
+
 from ibrobot_core.api import Late, hookimpl
-from ibrobot_core.app import Command, ReportDescriptor
+from ibrobot_core.app import Command
 from ibrobot_eval.options import EVENTS, KIND, SETTINGS
 
 
@@ -27,8 +29,9 @@ def ibrobot_reports() -> Iterable[ReportDescriptor]:
     """Evaluations."""
     yield ReportDescriptor(
         KIND,
-        "Results",
-        _is_evaluation,
-        Late("ibrobot_eval.contents:lines_of"),
-        Late("ibrobot_eval.contents:read_contents"),
+        summary="Successes of policies, and their comparison.",
+        label="Results",
+        reads=_is_evaluation,
+        lines=Late("ibrobot_eval.contents:lines_of"),
+        make=Late("ibrobot_eval.contents:read_contents"),
     )

@@ -7,8 +7,9 @@ import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from ibrobot_provenance.reports import Case, Cases, Plots, ReportSection, Table, Text
+
 from ibrobot_core.api import DatasetError
-from ibrobot_core.app import Case, Cases, Plots, ReportSection, Table, Text
 from ibrobot_eval import plots
 from ibrobot_eval.episodes import Result
 from ibrobot_eval.options import REPORT

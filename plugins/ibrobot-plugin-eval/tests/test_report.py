@@ -13,10 +13,10 @@ from ibrobot_eval.film import encode
 from ibrobot_eval.options import REPORT
 from ibrobot_eval.page import as_page
 from ibrobot_eval.report import Report, write_report
+from ibrobot_provenance.reports import PLOT_CLASSES, Cases, Plots, Table, Text
 from ibrobot_provenance.svg import Axis
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import PLOT_CLASSES, Cases, Plots, Table, Text
 
 from .made_results import policy, result
 

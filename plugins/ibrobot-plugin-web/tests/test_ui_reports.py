@@ -7,21 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ibrobot_provenance.reports import PLOT_CLASSES, Case, Cases, Plots, ReportDescriptor, ReportSection, Table, Text
 from ibrobot_web.ui import recordings, reports
 from ui_server import UiServer, run_ui
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import (
-    PLOT_CLASSES,
-    Case,
-    Cases,
-    Plots,
-    Registry,
-    ReportDescriptor,
-    ReportSection,
-    Table,
-    Text,
-)
+from ibrobot_core.app import Registry
 
 STATIC = Path(reports.__file__).parents[1] / "static"
 FILE = "tasting.txt"
@@ -43,14 +34,15 @@ def taste(folder: Path) -> list[ReportSection]:
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     descriptor = ReportDescriptor(
         "tasting",
-        "Tastings",
-        lambda path: (path / FILE).is_file(),
-        lambda path: [taste(path)[0].title],
-        taste,
+        summary="what was tasted",
+        label="Tastings",
+        reads=lambda path: (path / FILE).is_file(),
+        lines=lambda path: [taste(path)[0].title],
+        make=taste,
     )
-    registry = Registry(reports=[descriptor])
     for module in (recordings, reports):
-        monkeypatch.setattr(module, "installed_plugins", lambda: registry)
+        monkeypatch.setattr(module, "kinds_of_reports", lambda: {"tasting": descriptor})
+    monkeypatch.setattr(recordings, "installed_plugins", Registry)
     opened = tmp_path / "opened"
     for name in ("good", "bad"):
         (opened / name).mkdir(parents=True)

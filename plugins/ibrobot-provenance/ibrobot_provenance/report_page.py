@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
-from ibrobot_core.app import Case, Cases, Plots, ReportSection, Table, Text
+from ibrobot_provenance.reports import Case, Cases, Plots, ReportSection, Table, Text
 from ibrobot_provenance.svg import tag
 
 _STYLE = """

@@ -16,7 +16,6 @@ from ibrobot_core.descriptors import (
     HardwareDescriptor,
     PanelDescriptor,
     ReaderDescriptor,
-    ReportDescriptor,
     SensorDescriptor,
 )
 
@@ -59,7 +58,6 @@ WITHOUT_NAME: Mapping[str, Callable[[], object]] = {
     "ibrobot_commands": lambda: Command(3),  # type: ignore[arg-type]
     "ibrobot_panels": lambda: PanelDescriptor(3, (), _nothing),  # type: ignore[arg-type]
     "ibrobot_guides": lambda: GuideDescriptor("x", Path("x"), "x", _nothing),  # type: ignore[arg-type]
-    "ibrobot_reports": lambda: ReportDescriptor("x", 3, _nothing, _nothing, _nothing),  # type: ignore[arg-type]
     "ibrobot_doctor": lambda: Check("x", True, 3),  # type: ignore[arg-type]
 }
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_provenance.reports import kinds_of_reports
 
 from ibrobot_core.api import NS_PER_S, IbrobotError, PolicyDescriptor
 from ibrobot_core.app import installed_plugins
@@ -45,16 +46,17 @@ def find_recordings(opened: Folders) -> Found:
     """The episodes, datasets and reports in the opened folders."""
     registry = installed_plugins()
     readers = registry.readers
-    reports: dict[str, dict[Path, None]] = {each.name: {} for each in registry.reports}
+    kinds = kinds_of_reports()
+    reports: dict[str, dict[Path, None]] = {kind: {} for kind in kinds}
     episodes: list[Path] = []
     datasets: list[Path] = []
     trashes: list[Path] = []
     left = _MOST_FOLDERS
     for folder, folders, _ in opened.walk(_DEPTH):
         left -= 1
-        for each in registry.reports:
+        for kind, each in kinds.items():
             if each.reads(folder):
-                reports[each.name][folder] = None
+                reports[kind][folder] = None
         if any(reader.reads(folder) for reader in readers if not reader.numbered):
             episodes.append(folder)
         elif any(reader.reads(folder) for reader in readers if reader.numbered):

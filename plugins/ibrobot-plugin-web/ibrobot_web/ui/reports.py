@@ -6,9 +6,18 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_provenance.reports import (
+    Case,
+    Cases,
+    Plots,
+    ReportDescriptor,
+    ReportSection,
+    Table,
+    Text,
+    kinds_of_reports,
+)
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import Case, Cases, Plots, ReportDescriptor, ReportSection, Table, Text, installed_plugins
 from ibrobot_web.ui.context import File, Routes, Ui
 from ibrobot_web.ui.recordings import find_recordings
 
@@ -16,7 +25,7 @@ _VIDEO = ".mp4"
 
 
 def _kind(name: str) -> ReportDescriptor:
-    known = {each.name: each for each in installed_plugins().reports}
+    known = kinds_of_reports()
     if name not in known:
         raise IbrobotError(f"{name[:40]!r} is no kind of report; installed: {', '.join(known) or 'none'}")
     return known[name]
@@ -25,7 +34,7 @@ def _kind(name: str) -> ReportDescriptor:
 def listing(ui: Ui, kind: str) -> list[dict[str, Any]]:
     """The folders of a kind in the opened folders, the newest first."""
     descriptor = _kind(kind)
-    reports = find_recordings(ui.folders).reports.get(descriptor.name, ())
+    reports = find_recordings(ui.folders).reports.get(descriptor.type, ())
     rows = []
     for folder in reports:
         try:
@@ -42,7 +51,7 @@ def show(ui: Ui, path: str, kind: str) -> list[dict[str, Any]]:
     folder = ui.folders.find(path)
     descriptor = _kind(kind)
     if not descriptor.reads(folder):
-        raise IbrobotError(f"{ui.folders.name(folder)}: is not among the {descriptor.title.lower()}")
+        raise IbrobotError(f"{ui.folders.name(folder)}: is not among the {descriptor.label.lower()}")
     try:
         return [_section(ui, each) for each in descriptor.make(folder)]
     except IbrobotError as error:

@@ -15,9 +15,10 @@ import attrs
 from aiohttp import WSMsgType, web
 from ibrobot_http.files import add_files
 from ibrobot_http.guard import Guard
+from ibrobot_provenance.reports import kinds_of_reports
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import ConfigError, error_text, installed_plugins
+from ibrobot_core.app import ConfigError, error_text
 from ibrobot_web.pictures import Picture
 from ibrobot_web.server.app import STATIC
 from ibrobot_web.ui.context import File, Handler, Routes, Ui, read_facts, read_query
@@ -90,8 +91,8 @@ def views() -> list[dict[str, Any]]:
         at = next((i for i, view in enumerate(made) if view["name"] == before), len(made) - 1)
         made.insert(at, {**job, "group": made[at]["group"] or last})
     made[-1:-1] = [
-        {"name": f"report-{each.name}", "title": each.title, "module": "reports", "report": each.name, "group": last}
-        for each in installed_plugins().reports
+        {"name": f"report-{kind}", "title": each.label, "module": "reports", "report": kind, "group": last}
+        for kind, each in kinds_of_reports().items()
     ]
     return made
 

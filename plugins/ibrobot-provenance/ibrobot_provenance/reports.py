@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import attrs
+
+from ibrobot_core.api import Descriptor
+from ibrobot_core.app import installed_plugins
 
 PLOT_CLASSES = (
     "ok", "bad", "bad-fill", "faint", "range", "band", "estimate", "grid", "zero", "margin", "label",
@@ -63,3 +67,21 @@ class ReportSection:
 
     title: str
     blocks: tuple[Text | Table | Plots | Cases, ...]
+
+
+@attrs.frozen
+class ReportDescriptor(Descriptor[Any]):
+    """Folders with results that pages list, and show as a report; `type` as in `Shown.made`, e.g. `evaluation`."""
+
+    make: Callable[[Path], Sequence[ReportSection]] = attrs.field(kw_only=True)  # type: ignore[assignment]
+    """Returns the report on a folder; raises IbrobotError."""
+    reads: Callable[[Path], bool] = attrs.field(kw_only=True)
+    """Returns whether a folder is one, by the names of its files."""
+    lines: Callable[[Path], Sequence[str]] = attrs.field(kw_only=True)
+    """Returns the result of a folder in a few lines; raises IbrobotError."""
+
+
+def kinds_of_reports() -> dict[str, ReportDescriptor]:
+    """Type -> descriptor, of the installed plugins."""
+    known = installed_plugins().of_kind("report")
+    return {each.type: each for each in known if isinstance(each, ReportDescriptor)}
