@@ -184,3 +184,19 @@ def test_core_drops_positions_of_a_device_that_does_not_heed_its_own_deadman(
     run.step()
     run.reset()
     assert way(run) == [False, False], "it is still pressed"
+
+
+def test_a_device_that_leaves_a_joint_of_an_executor_out_is_reported(
+    runs: Runs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = runs.start(
+        "robot.groups.both=[pan, grip]", "executors.both={type: position, group: both}",
+        "control_modes.teleop={executors: [both], teleop: left}",
+        "teleoperation.left={type: lever}", mode="teleop", by_operator=True,
+    )  # fmt: skip
+    left = runs.parts.MADE["left"]
+    left.operated = False
+    monkeypatch.setattr(left, "read", lambda measured: TeleopCommand({"pan": 0.1}))
+    assert way(run) == [False, False]
+    (warning,) = (record.getMessage() for record in caplog.records if "leaves" in record.getMessage())
+    assert warning.startswith("left (lever) leaves grip of executor both out, so its other joints hold, too: ")

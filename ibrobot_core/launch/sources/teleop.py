@@ -28,6 +28,8 @@ class TeleopSource(SourceWorker):
         self._devices = OperatorDevices(session, mode.devices)
         self._commands = False
         """Whether the last plan has joints; one without any lets them brake."""
+        self._whole = {name: session.config.executors[name].joints for name in mode.executors}
+        """Executor -> its joints; without those that hold since a device leaves joints out."""
         super().__init__(session, mode, f"teleop {self._devices}")
 
     @override
@@ -71,6 +73,11 @@ class TeleopSource(SourceWorker):
         if positions or self._commands:
             session.send_plan(session.clock.now_ns(), 1, tuple(positions), np.array([[*positions.values()]]))
         self._commands = bool(positions)
+        for executor, joints in [*self._whole.items()] if positions else ():
+            if (left_out := [each for each in joints if each not in positions]) and len(left_out) < len(joints):
+                del self._whole[executor]
+                text = "%s leaves %s of executor %s out, so its other joints hold, too: a device commands all or none"
+                session.log.warning(text, self._devices, ", ".join(left_out), executor)
         if command.positions and not command.approaching:
             session.followed_ns = session.clock.now_ns()
         for event in command.events:

@@ -148,7 +148,7 @@ def test_a_later_session_adds_its_episodes_and_what_is_not_converted_yet():
     [
         (["--convert-outcome", "success"], "--convert-outcome needs --convert"),
         (["--convert-out", "set"], "--convert-out needs --convert"),
-        (["--convert", "--convert-set", "what=1"], "what"),
+        ([*CONVERT, "--convert-set", "what=1"], "what"),
     ],
 )
 def test_options_that_do_not_fit_are_refused_before_the_robot_moves(options: list[str], error: str):
