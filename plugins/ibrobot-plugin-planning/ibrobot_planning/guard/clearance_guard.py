@@ -27,7 +27,7 @@ _DECAY_S = 1.0
 """Time in which the greatest distance from the path is forgotten by a factor of e [s]."""
 _HALVINGS = 3
 """How finely the share of a motion that leads nearer is chosen."""
-_MOST_LOOKS = 40
+_MOST_LOOKS = 20
 """Most configurations that are looked at in a tick, which bounds its time."""
 _ROUNDS = 3
 """How often a motion that slides is changed because of further pairs."""
