@@ -63,9 +63,8 @@ def picture(pose: tuple[float, ...], size: tuple[int, int] = SIZE) -> np.ndarray
     origin = -rotation.T @ np.array(pose[3:])
     met = (origin + directions * (-origin[2] / directions[:, 2])[:, None]) / (BOARD.square / 1000) * dots
     at = met[:, :2] + np.array([BOARD.columns, BOARD.rows]) * dots / 2 + dots - 0.5
-    places = at.reshape(size[1], size[0], 2).astype(np.float32)
-    flat = np.empty(0, np.float32)  # the second map, which is in the first
-    seen = cv2.remap(board, places, flat, cv2.INTER_AREA, borderMode=cv2.BORDER_CONSTANT, borderValue=90)
+    x, y = at.reshape(size[1], size[0], 2).astype(np.float32).transpose(2, 0, 1).copy()
+    seen = cv2.remap(board, x, y, cv2.INTER_AREA, borderMode=cv2.BORDER_CONSTANT, borderValue=90)
     return np.asarray(cv2.GaussianBlur(seen, (3, 3), 0.7), np.uint8)
 
 
