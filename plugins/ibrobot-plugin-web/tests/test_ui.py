@@ -40,7 +40,8 @@ def test_views_stand_in_groups_in_the_order_of_the_work() -> None:
     for view in views():
         groups.setdefault(view["group"], []).append(view["name"])
     assert list(groups) == ["Set up", "Record", "Learn", "Evaluate", ""]
-    learn = [f"job-{name}" for name in ("convert", "train") if takes(name)]  # installed ones
+    jobs = ("convert", "train", "explain", "datasets check")
+    learn = [f"job-{name}" for name in jobs if takes(name)]  # installed ones
     assert [name for name in groups["Learn"] if name not in learn] == ["datasets", "policies"]
     assert set(learn) <= set(groups["Learn"])
     assert "job-eval" in groups["Evaluate"]
