@@ -103,6 +103,11 @@ WRONG_FILES = {
     "topic list --config BAD": (),
     "topic pub /a std_msgs/msg/Bool {data:true} --config BAD": (),
     "ui BAD --no-browser --port 0": ("folder",),
+    "camera board -o BAD": (),
+    "camera calibrate BAD": (),
+    "explain BAD": (),
+    "datasets card BAD": (),
+    "datasets check BAD": (),
 }
 """Command line -> the kinds of files that are right there."""
 WITHOUT_FILES = {
@@ -229,6 +234,10 @@ JSON = {
     "plugins show opencv --json": 0,
     "doctor --json": None,
     "camera list --json": 0,
+    "camera calibrate BAD --json": 2,
+    "explain EPISODE --json": 0,
+    "explain BAD --json": 2,
+    "datasets check BAD --json": 2,
     "episodes answers EPISODE --json": 0,
     "episodes answers BAD --json": 2,
     "episodes info EPISODE --json": 0,

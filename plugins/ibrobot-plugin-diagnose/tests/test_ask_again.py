@@ -37,6 +37,6 @@ def test_answers_are_equal_bit_for_bit(episode):
 
 def test_unknown_model_is_named(episode):
     done = run_here("explain", episode, "--model", "another")
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert "no model 'another'" in done.stderr
     assert "scripted_pick" in done.stderr

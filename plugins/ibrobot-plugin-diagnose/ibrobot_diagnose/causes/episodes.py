@@ -41,14 +41,14 @@ class IdleStart(_Still):
         "idle_start_s",
         "at the beginning",
     )
-    remedy = "Cut it: `ibrobot episodes trim EPISODE --start TIME`; a policy learns to wait from it."
+    remedy = "Cut it: `ibrobot episodes trim EPISODE --from SECONDS`; a policy learns to wait from it."
 
 
 class IdleEnd(_Still):
     """The episode ends with time in which nothing moves."""
 
     name, title, series, where = "idle_end", "the episode ends soon after the motion", "idle_end_s", "at the end"
-    remedy = "Cut it: `ibrobot episodes trim EPISODE --end TIME`."
+    remedy = "Cut it: `ibrobot episodes trim EPISODE --to SECONDS`."
 
 
 class Stall(_Still):

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import attrs
 from ibrobot_provenance.jobs import Job, open_pool
 
-from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import Emit, RequestError, Unsuccessful, echo, wrong_input
 from ibrobot_diagnose.options import ExplainOptions, Progress, Report
 from ibrobot_diagnose.references import card_of, find_episodes, read_episode
@@ -68,12 +67,9 @@ class Explain(ExplainOptions):
 def _explained(
     options: ExplainOptions, episodes: Sequence[Path], card: Card | None
 ) -> Iterator[tuple[Path, dict[str, Any], str]]:
-    """Each episode with its explanation, or why there is none."""
+    """Each episode with its explanation, or why there is none; a single one that cannot be explained is an error."""
     if len(episodes) == 1 and not options.on:
-        try:
-            yield episodes[0], explain_episode((episodes[0], options, card)), ""
-        except IbrobotError as error:
-            yield episodes[0], {}, str(error)
+        yield episodes[0], explain_episode((episodes[0], options, card)), ""
         return
     work = [Job(explain_episode, (episode, options, card)) for episode in episodes]
     with closing(open_pool(options.on, options.jobs)) as pool, closing(pool.run(work)) as finished:
