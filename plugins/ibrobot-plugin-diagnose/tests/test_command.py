@@ -77,13 +77,18 @@ def test_ticks_are_added_on_request(folder):
     assert explained["between"]["share_held"] > 0.1
 
 
+@pytest.mark.usefixtures("fork_server")
 def test_unreadable_episode_is_named_and_the_others_are_explained(folder, tmp_path):
     bad = tmp_path / "bad"
     bad.mkdir()
     (bad / "metadata.yaml").write_text("nothing: 1\n")
-    done = run_here("explain", bad)
-    assert done.returncode == 1
-    assert str(bad) in done.stderr
+    alone = run_here("explain", bad)
+    assert (alone.returncode, alone.stdout) == (2, "")
+    assert f"error: {bad}: has no .mcap or .db3 file" in alone.stderr
+    both = run_here("explain", bad, folder / "runs" / "episodes" / "episode_000001", "--jobs", 1)
+    assert both.returncode == 1
+    assert str(bad) in both.stderr
+    assert "What to do" in both.stdout
 
 
 @pytest.mark.usefixtures("fork_server")
