@@ -91,6 +91,7 @@ def test_show_fills_in_the_defaults_and_loads_again(ibrobot: Ibrobot, robot: Pat
         "stop_time": 0.3,
         "following_error": {"distance": 0.25, "timeout": 2.0},
         "load_shedding": {"after": 60.0, "pose": ""},
+        "guard": None,
     }
     robot.write_text(shown.out)
     assert ibrobot("config", "show", "mini.yaml").out == shown.out

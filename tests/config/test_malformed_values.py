@@ -237,7 +237,7 @@ CASES = {
         (
             "robot.yaml:41: control.more: an alias to the block that contains it\n"
             "robot.yaml:41: control.more: unknown key; known keys: rate_hz, startup, stop, priority, state_timeout, "
-            "peer_timeout, stop_time, following_error, load_shedding"
+            "peer_timeout, stop_time, following_error, load_shedding, guard"
         ),
     ),
     "merge_of_list": (

@@ -13,6 +13,7 @@ from ibrobot_core.control.commands import (
     PERMITTED,
     BeginStartup,
     CancelGoals,
+    ChangeWorld,
     ClearFaults,
     Command,
     EmergencyStop,
@@ -312,6 +313,7 @@ COMMANDS: tuple[Command, ...] = (
     EmergencyStop(),
     Halt(),
     BeginStartup(),
+    ChangeWorld({}),
 )
 CAUSES = {
     EmergencyStop: Cause.EMERGENCY_STOP,

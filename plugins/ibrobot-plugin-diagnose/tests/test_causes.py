@@ -12,6 +12,7 @@ from made_runs import Run, window_of
 from planted_faults import JOINTS, PICTURES, STRENGTHS, TIMES
 
 from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import Registry
 
 SEEDS = range(9000, 9003)
 """Seeds on which no threshold was chosen."""
@@ -95,7 +96,7 @@ class Squeaks(Cause):
 
 def test_other_packages_add_causes(monkeypatch):
     offered = CauseDescriptor(type="squeaks", make=Squeaks, summary="a joint squeaks")
-    monkeypatch.setattr("ibrobot_core.plugins.Registry.of_kind", lambda self, kind: [offered] * (kind == KIND))
+    monkeypatch.setattr(Registry, "of_kind", lambda self, kind: [offered] * (kind == KIND))
     assert diagnose(window_of(Run(cameras=())), Reference()).first == "squeaks"
     monkeypatch.setattr(Squeaks, "name", "plan_dry")
     with pytest.raises(IbrobotError, match="there is a cause 'plan_dry' already"):
