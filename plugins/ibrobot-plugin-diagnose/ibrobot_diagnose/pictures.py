@@ -1,17 +1,20 @@
 """Comparison of pictures: size of a thumbnail, brightness, sharpness, colours, and how far a camera has moved.
 
-Needs numpy alone, and is the only module that compares pictures.
+No other module compares pictures. It also writes and reads the PNG files of cards and reports.
 """
 
 from __future__ import annotations
 
-import struct
-import zlib
+import io
 from collections.abc import Sequence
 
 import attrs
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
+
+_MOST_PIXELS = 1 << 24
+"""Largest picture that is read."""
 
 type Grey = NDArray[np.float32]
 
@@ -260,43 +263,21 @@ def _correlation(one: Grey, other: Grey, weight: Grey) -> float:
 
 def png(picture: NDArray[np.uint8]) -> bytes:
     """A PNG file of a picture in colours, shape (H, W, 3)."""
-    height, width = picture.shape[:2]
-    rows = np.zeros((height, 1 + 3 * width), np.uint8)
-    rows[:, 1:] = picture.reshape(height, -1)
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", head)
-        + chunk(b"IDAT", zlib.compress(rows.tobytes(), 6))
-        + chunk(b"IEND", b"")
-    )
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "PNG")
+    return file.getvalue()
 
 
 def read_png(data: bytes) -> NDArray[np.uint8]:
     """The picture of a file of `png`.
 
     Raises:
-        ValueError: if it is another file.
+        ValueError: if it is another file, or damaged.
     """
-    if data[:16] != b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + b"IHDR":
-        raise ValueError("it is no PNG file")
-    width, height, depth, colours = struct.unpack(">IIBB", data[16:26])
-    body, place = b"", 33
-    while place + 8 <= len(data):
-        (length,) = struct.unpack(">I", data[place : place + 4])
-        if data[place + 4 : place + 8] == b"IDAT":
-            body += data[place + 8 : place + 8 + length]
-        place += 12 + length
-    if (depth, colours) != (8, 2) or not 0 < width * height <= 1 << 24:
-        raise ValueError("it is no PNG file of 8-bit colours and a plausible size")
-    decoder = zlib.decompressobj()
-    size = height * (1 + 3 * width)
-    raw = decoder.decompress(body, size)
-    rows = np.frombuffer(raw, np.uint8)
-    if len(rows) != size or rows.reshape(height, -1)[:, 0].any():
-        raise ValueError("its rows are incomplete, or filtered")
-    return rows.reshape(height, -1)[:, 1:].reshape(height, width, 3).copy()
+    try:
+        with Image.open(io.BytesIO(data), formats=("PNG",)) as picture:
+            if picture.mode != "RGB" or picture.width * picture.height > _MOST_PIXELS:
+                raise ValueError(f"a picture is {picture.mode} of {picture.width} x {picture.height} pixels")
+            return np.array(picture, np.uint8)
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:  # as Pillow reports damage
+        raise ValueError(f"a picture cannot be read: {error}") from None

@@ -100,8 +100,7 @@ class UnseenStates(Cause):
         since = window.since(int(window.ticks_ns[outside.any(axis=1).argmax()]))
         text = (
             f"{window.joints[j]} left the range of the data ({low[j]:.2f} to {high[j]:.2f} rad) from {since:.1f} s on; "
-            "the arm "
-            f"was outside in {100 * share:.0f} % of the run."
+            f"the arm was outside in {100 * share:.0f} % of the run."
         )
         return Evidence(text, 100 * share, "%", 15.0, likelihood(share, 0.15, 0.6), since)
 
@@ -115,8 +114,7 @@ class OtherSpeed(Cause):
     explains = frozenset({"limits_low"})
     remedy = (
         "Execute chunks at the rate of the data: `contract: {rate_hz: …}` of the robot and of the recordings must "
-        "agree; look "
-        "for a policy that was trained on data that was sampled at another rate."
+        "agree; look for a policy that was trained on data that was sampled at another rate."
     )
 
     @override

@@ -124,8 +124,7 @@ class JointOrder(Cause):
     explains = _CONSEQUENCES | {"joint_zero", "gripper_scaled", "gripper_reversed", "arm_not_following"}
     remedy = (
         "Compare the order of `joints` in the robot YAML with that of the data (`ibrobot datasets info`), and the "
-        "motors' "
-        "numbers with their joints: move one by hand, and see which number changes."
+        "motors' numbers with their joints: move one by hand, and see which number changes."
     )
 
     @override
