@@ -31,7 +31,7 @@ _LINES_PER_LOG_LINE = 6
 _RECENT_NS = 3 * NS_PER_S
 """Time over which rates are measured [ns]."""
 _SAMPLE_NS = NS_PER_S // 4
-_JOINT_WIDTH = 47
+_JOINT_WIDTH = 41
 """Width of a joint's name and numbers [columns]."""
 
 
@@ -214,12 +214,12 @@ class _Joints:
         state, robot = self._session.state, self._session.config.robot
         if state is None:
             return
+        yield styled("joints [rad, or m where they slide]", "dim")
         table = Table.grid(padding=(0, 1))
         for i, joint in enumerate(robot.joints):
             done = float(np.clip((state.position[i] - joint.lower) / (joint.upper - joint.lower), 0.0, 1.0))
             room = max(0, options.max_width - _JOINT_WIDTH)
             bar = [ProgressBar(total=1.0, completed=done, width=min(room, 30))] if room else []
-            table.add_row(
-                joint.name, f"{state.position[i]:+.3f}", styled(f"target {state.command[i]:+.3f} rad", "dim"), *bar
-            )
+            target = styled(f"target {state.command[i]:+.2f}", "dim")
+            table.add_row(joint.name, f"{state.position[i]:+.2f}", target, *bar)
         yield table

@@ -170,6 +170,7 @@ def test_a_wide_terminal_shows_all_facts(runs: Runs):
         "loop ",
         "episodes 0 done",
         "faults 0 now, 0 in this run",
+        "joints [rad, or m where they slide]",
         "pan +0.",
         "target +0.",
         "grip",

@@ -138,6 +138,9 @@ def test_the_page_shows_the_robot_and_asks_no_other_host(tab: Tab, address: str)
     assert tab.text("#robot") == "so101"
     assert tab.ask("document.querySelector('#view .note').textContent") == "", "3D has a problem"
     assert tab.page.locator(".joint").count() == 6
+    assert tab.page.locator(".joint output").first.inner_text().endswith(" rad"), "as the panel in the terminal"
+    tab.page.get_by_role("button", name="in radians").click()
+    tab.until(lambda: tab.page.locator(".joint output").first.inner_text().endswith("°"))
     for name in ("Plots", "Health", "Log"):
         toggle = tab.page.get_by_role("button", name=name, exact=True)
         toggle.click()

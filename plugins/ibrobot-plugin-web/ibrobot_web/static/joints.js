@@ -11,7 +11,7 @@ export class Joints {
     this.section = section;
     this.page = page;
     this.rows = [];
-    this.degrees = localStorage.getItem(KEY) !== "rad";
+    this.degrees = localStorage.getItem(KEY) === "deg"; // radians as in the YAML, goals and the panel of the terminal
     this.unit = h("button", { class: "small", onclick: () => this.setUnit(!this.degrees) });
     this.list = h("div", {});
     section.append(h("div", { class: "title" }, h("h2", {}, "Joints"), this.unit), this.list);
