@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, override
 
 import attrs
 import numpy as np
@@ -94,6 +94,36 @@ class Cause(ABC):
     @abstractmethod
     def test(self, window: Window, reference: Reference) -> Evidence | None:
         """Evidence for this cause; None if nothing points to it."""
+
+
+class CardCause(Cause):
+    """A cause that compares a window with the card of the model's data."""
+
+    needs = frozenset({"card"})
+
+    @abstractmethod
+    def compare(self, window: Window, card: Card) -> Evidence | None:
+        """As `test`, with the card."""
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        assert reference.card is not None
+        return self.compare(window, reference.card)
+
+
+class ModelCause(Cause):
+    """A cause that looks at what the model answers when it is asked again."""
+
+    needs = frozenset({"model"})
+
+    @abstractmethod
+    def compare(self, window: Window, model: Examined) -> Evidence | None:
+        """As `test`, with the answers."""
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        assert reference.model is not None
+        return self.compare(window, reference.model)
 
 
 @attrs.frozen

@@ -32,6 +32,8 @@ type Times = NDArray[np.int64]
 
 COMMANDER = "/commander"
 OPERATOR = "operator"
+COMPARED = 60
+"""Pictures of each camera that are compared with the data."""
 KEPT = 48
 """Pictures of each camera that are kept in a larger size, evenly over the window."""
 
@@ -125,6 +127,12 @@ class Camera:
         """All pictures at the size of a thumbnail, shape (N, H, W, 3), from 0 to 255."""
         shown = [each.small for each in self.pictures]
         return np.stack(shown).astype(np.float32) if shown else np.empty((0, *SMALL, 3), np.float32)
+
+    @cached_property
+    def sample(self) -> NDArray[np.float32]:
+        """Some of these, evenly over the window."""
+        count = len(self.small)
+        return self.small[np.unique(np.linspace(0, count - 1, min(COMPARED, count)).round().astype(int))]
 
 
 @attrs.frozen

@@ -6,26 +6,23 @@ from typing import override
 
 import numpy as np
 
-from ibrobot_diagnose.card import moving_speed
-from ibrobot_diagnose.cause import Cause, Evidence, Reference, likelihood
+from ibrobot_diagnose.card import Card, moving_speed
+from ibrobot_diagnose.cause import CardCause, Cause, Evidence, likelihood
 from ibrobot_diagnose.causes.pictures import pairs
 from ibrobot_diagnose.course import begins_to_move
 from ibrobot_diagnose.window import Window
 
 
-class OtherPrompt(Cause):
+class OtherPrompt(CardCause):
     """The model was given a task that is not in its data."""
 
     name = "other_prompt"
     title = "the task is one of the data's"
-    needs = frozenset({"card"})
     explains = frozenset({"stands_still"})
     remedy = "Give the model a task of its data, in the same words: `inference: {prompt: …}`."
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        card = reference.card
-        assert card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
         known = [text for text in card.prompts if text]
         if not window.prompt or not known or window.prompt in known:
             return None
@@ -42,7 +39,7 @@ def _plain(text: str) -> str:
     return " ".join(text.lower().replace(".", " ").split())
 
 
-class UnseenStart(Cause):
+class UnseenStart(CardCause):
     """The run begins where no demonstration begins."""
 
     name = "unseen_start"
@@ -52,9 +49,7 @@ class UnseenStart(Cause):
     remedy = "Bring the arm to the start of the demonstrations before each run, or record episodes that begin here."
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        card = reference.card
-        assert card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
         known = np.flatnonzero(np.isfinite(window.states).all(axis=1))
         if window.joints != card.joints or not len(known):
             return None
@@ -71,7 +66,7 @@ class UnseenStart(Cause):
         return Evidence(text, float(off[j]), "rad", 0.1, likelihood(float(off[j]), 0.1, 0.25), 0.0)
 
 
-class UnseenStates(Cause):
+class UnseenStates(CardCause):
     """The run leaves what the data shows."""
 
     name = "unseen_states"
@@ -83,9 +78,7 @@ class UnseenStates(Cause):
     )
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        card = reference.card
-        assert card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
         if window.joints != card.joints:
             return None
         low, high = card.row(card.state, 0.0), card.row(card.state, 1.0)
@@ -105,7 +98,7 @@ class UnseenStates(Cause):
         return Evidence(text, 100 * share, "%", 15.0, likelihood(share, 0.15, 0.6), since)
 
 
-class OtherSpeed(Cause):
+class OtherSpeed(CardCause):
     """The arm moves faster or slower than in the data."""
 
     name = "other_speed"
@@ -118,9 +111,7 @@ class OtherSpeed(Cause):
     )
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        card = reference.card
-        assert card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
         speed = moving_speed(window)
         low, high = (card.quantile("moving_speed", level) for level in (0.05, 0.95))
         if window.joints != card.joints or speed <= 0 or low <= 0:
@@ -131,7 +122,7 @@ class OtherSpeed(Cause):
         return Evidence(text, factor, "times", 1.45, likelihood(factor, 1.45, 2.2))
 
 
-class Statistics(Cause):
+class Statistics(CardCause):
     """The model's actions are not in the range of its data."""
 
     name = "statistics"
@@ -147,9 +138,7 @@ class Statistics(Cause):
     )
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        card = reference.card
-        assert card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
         used = [each for each in window.asked if each.used and each.answer.joint_names == card.joints]
         if not used or window.joints != card.joints:
             return None
@@ -181,7 +170,7 @@ class Statistics(Cause):
         return Evidence(text, number, "times", 1.5, likelihood(number, 1.5, 3.0), 0.0, details)
 
 
-class IdleData(Cause):
+class IdleData(CardCause):
     """Demonstrations begin with time in which nothing moves, and the policy has learned to stand still."""
 
     name = "idle_data"
@@ -195,9 +184,7 @@ class IdleData(Cause):
     )
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        card = reference.card
-        assert card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
         idle, still = card.quantile("idle_start_s", 0.5), begins_to_move(window)
         text = (
             f"Demonstrations stand still for {idle:.1f} s at their beginning, and the policy did for {still:.1f} s: "
@@ -208,7 +195,7 @@ class IdleData(Cause):
         return Evidence(text, idle, "s", 1.2, both, 0.0)
 
 
-class CheckpointEarly(Cause):
+class CheckpointEarly(CardCause):
     """The model has seen its data too few times."""
 
     name = "checkpoint_early"
@@ -218,9 +205,7 @@ class CheckpointEarly(Cause):
     remedy = "Train on: the same `ibrobot train` with more --steps continues from the newest checkpoint."
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        card = reference.card
-        assert card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
         assert card.trained is not None
         try:
             step, steps, batch = (float(card.trained[name]) for name in ("step", "steps", "batch_size"))
@@ -235,7 +220,7 @@ class CheckpointEarly(Cause):
         return Evidence(text, passes, "times", 2.0, likelihood(passes, 2.0, 0.7))
 
 
-class UnseenSuccess(Cause):
+class UnseenSuccess(CardCause):
     """The run looks like a success, but was judged a failure."""
 
     name = "unseen_success"
@@ -248,11 +233,11 @@ class UnseenSuccess(Cause):
     )
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
+    def compare(self, window: Window, card: Card) -> Evidence | None:
         if window.outcome != "failure":
             return None
         best: tuple[float, str] | None = None
-        for pair in pairs(window, reference):
+        for pair in pairs(window, card):
             owners = [name for name, _ in pair.card.places]
             firsts = [i for i, name in enumerate(owners) if not i or owners[i - 1] != name]
             lasts = [i for i, name in enumerate(owners) if i + 1 == len(owners) or owners[i + 1] != name]

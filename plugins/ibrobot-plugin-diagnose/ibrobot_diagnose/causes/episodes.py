@@ -6,14 +6,14 @@ from typing import ClassVar, override
 
 import numpy as np
 
-from ibrobot_diagnose.card import jerk_of, rests_of, series_of, way_of
-from ibrobot_diagnose.cause import Cause, Evidence, Reference, likelihood
+from ibrobot_diagnose.card import Card, jerk_of, rests_of, series_of, way_of
+from ibrobot_diagnose.cause import CardCause, Cause, Evidence, Reference, likelihood
 from ibrobot_diagnose.window import Window
 
 _SHOWN = frozenset({"demonstration", "state"})
 
 
-class _Still(Cause):
+class _Still(CardCause):
     """Nothing moves for a time."""
 
     needs = _SHOWN | {"card"}
@@ -22,11 +22,10 @@ class _Still(Cause):
     where: ClassVar[str]
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        assert reference.card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
         start, end, stall, begin = rests_of(window)
         seconds = {"idle_start_s": start, "idle_end_s": end, "stall_s": stall}[self.series]
-        usual = max(self.least_s, 1.3 * reference.card.quantile(self.series, 0.75) + 0.3)
+        usual = max(self.least_s, 1.3 * card.quantile(self.series, 0.75) + 0.3)
         text = f"Nothing moves for {seconds:.1f} s {self.where}; up to {usual:.1f} s are usual in the other episodes."
         since = {"idle_start_s": 0.0, "idle_end_s": window.seconds - end, "stall_s": begin}[self.series]
         return Evidence(text, seconds, "s", usual, likelihood(seconds, usual, 2.0 * usual), since)
@@ -60,7 +59,7 @@ class Stall(_Still):
     remedy = "Drop the episode, or keep the part before or after: `ibrobot episodes trim`."
 
 
-class Jerk(Cause):
+class Jerk(CardCause):
     """The motion is jerky."""
 
     name, title = "jerk", "the motion is as smooth as in the other episodes"
@@ -69,9 +68,8 @@ class Jerk(Cause):
     remedy = "Drop the episode; look for a leader that sticks, a device with gaps, or a control rate that is too low."
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        assert reference.card is not None
-        jerk, usual = jerk_of(window), 1.3 * reference.card.quantile("jerk", 0.95)
+    def compare(self, window: Window, card: Card) -> Evidence | None:
+        jerk, usual = jerk_of(window), 1.3 * card.quantile("jerk", 0.95)
         text = (
             f"The motion is jerky: its speed changes by {jerk:.1f} times itself per second; up to {usual:.1f} are "
             "usual."
@@ -157,7 +155,7 @@ class PictureGaps(Cause):
         return Evidence(text, ratio, "times", 6.0, likelihood(ratio, 6.0, 15.0), window.since(begin))
 
 
-class GripperIdle(Cause):
+class GripperIdle(CardCause):
     """The gripper never acts."""
 
     name, title = "gripper_idle", "the gripper acts"
@@ -165,9 +163,7 @@ class GripperIdle(Cause):
     remedy = "Drop the episode if the task needs the gripper; look at its motor, and at the leader's handle."
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        card = reference.card
-        assert card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
         grippers = [j for j, joint in enumerate(window.joints) if "grip" in joint or "jaw" in joint]
         known = window.states[np.isfinite(window.states).all(axis=1)]
         usual = card.row(card.state, 0.95) - card.row(card.state, 0.05)
@@ -180,7 +176,7 @@ class GripperIdle(Cause):
         return Evidence(text, 100 * share, "%", 20.0, likelihood(share, 0.2, 0.06))
 
 
-class _Odd(Cause):
+class _Odd(CardCause):
     """A number of the episode lies far from those of the others."""
 
     needs = _SHOWN | {"card"}
@@ -189,10 +185,9 @@ class _Odd(Cause):
     unit: ClassVar[str]
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        assert reference.card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
         value = series_of(window)[self.series]
-        low, middle, high = (reference.card.quantile(self.series, level) for level in (0.05, 0.5, 0.95))
+        low, middle, high = (card.quantile(self.series, level) for level in (0.05, 0.5, 0.95))
         if middle <= 0 or low <= 0:
             return None
         factor = max(value / high, low / max(value, 1e-6))
@@ -217,7 +212,7 @@ class OddPath(_Odd):
     remedy = "Look at it: something went wrong, or another task was done."
 
 
-class Duplicate(Cause):
+class Duplicate(CardCause):
     """The episode is that of another number."""
 
     name, title = "duplicate", "no other episode is nearly the same"
@@ -225,9 +220,7 @@ class Duplicate(Cause):
     remedy = "Drop one of the two: copies make the others count less, and a test on one of them means nothing."
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        card = reference.card
-        assert card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
         if not np.isfinite(window.states).all(axis=1).any() or not len(card.ways):
             return None
         distance = float(np.abs(card.ways - way_of(window)[None]).max(axis=1).min())

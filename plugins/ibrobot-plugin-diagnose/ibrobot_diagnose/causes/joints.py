@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_diagnose.card import LEVELS, Card
-from ibrobot_diagnose.cause import Cause, Evidence, Reference, likelihood
+from ibrobot_diagnose.cause import CardCause, Cause, Evidence, likelihood
 from ibrobot_diagnose.causes.pictures import pairs
 from ibrobot_diagnose.pictures import descriptors, nearest
 from ibrobot_diagnose.window import Floats, Window
@@ -43,10 +43,10 @@ def _costs(states: Floats, card: Card) -> NDArray[np.float64]:
     return result
 
 
-def nearest_poses(window: Window, reference: Reference) -> tuple[Floats, Floats]:
+def nearest_poses(window: Window, card: Card) -> tuple[Floats, Floats]:
     """Positions of the joints in the window, and those of the data at pictures that look the same; shape (N, J)."""
     own, theirs = [], []
-    for pair in pairs(window, reference):
+    for pair in pairs(window, card):
         times = np.array(pair.camera.times_ns, np.int64)
         index = np.unique(np.linspace(0, len(times) - 1, min(120, len(times))).round().astype(int))
         distance, near = nearest(descriptors(pair.camera.small[index]), pair.card.vectors)
@@ -58,7 +58,7 @@ def nearest_poses(window: Window, reference: Reference) -> tuple[Floats, Floats]
     return (np.concatenate(own), np.concatenate(theirs)) if own else (np.empty((0, size)), np.empty((0, size)))
 
 
-class OtherUnits(Cause):
+class OtherUnits(CardCause):
     """Positions are in another unit."""
 
     name = "other_units"
@@ -71,9 +71,7 @@ class OtherUnits(Cause):
     )
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        card = reference.card
-        assert card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
         if not _same(window, card):
             return None
         states, usual = _known(window), np.abs(card.state).max()
@@ -94,19 +92,16 @@ class OtherUnits(Cause):
         return Evidence(text, ratio, "times", 4.0, likelihood(ratio, 4.0, 8.0))
 
 
-class OtherNormMode(Cause):
+class OtherNormMode(CardCause):
     """The model is given another unit than that of its training."""
 
     name = "other_norm_mode"
     title = "the model gets the unit of its training"
-    needs = frozenset({"card"})
     explains = _CONSEQUENCES
     remedy = "Set `norm_mode` of the model in the robot YAML to the unit of its training."
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        card = reference.card
-        assert card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
         model = (window.document.get("models") or {}).get(window.policy.get("model", ""), {})
         given = model.get("norm_mode") if isinstance(model, dict) else None
         if given is None or card.norm_mode is None or given == card.norm_mode:
@@ -115,7 +110,7 @@ class OtherNormMode(Cause):
         return Evidence(text, 1.0, "difference", 0.5, 0.98)
 
 
-class JointOrder(Cause):
+class JointOrder(CardCause):
     """Joints have each other's place."""
 
     name = "joint_order"
@@ -128,9 +123,7 @@ class JointOrder(Cause):
     )
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        card = reference.card
-        assert card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
         size = len(window.joints)
         if not _same(window, card) or size > 16:
             return None
@@ -164,7 +157,7 @@ def _assignment(costs: NDArray[np.float64]) -> NDArray[np.intp]:
     return order
 
 
-class JointZero(Cause):
+class JointZero(CardCause):
     """The zero of a joint is shifted."""
 
     name = "joint_zero"
@@ -178,12 +171,10 @@ class JointZero(Cause):
     )
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        card = reference.card
-        assert card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
         if not _same(window, card):
             return None
-        own, theirs = nearest_poses(window, reference)
+        own, theirs = nearest_poses(window, card)
         if len(own) < 10:
             return None
         differences = own - theirs
@@ -212,7 +203,7 @@ def _gripper(window: Window) -> int | None:
     return names[0] if len(names) == 1 else None
 
 
-class GripperScaled(Cause):
+class GripperScaled(CardCause):
     """The gripper has another range."""
 
     name = "gripper_scaled"
@@ -222,9 +213,8 @@ class GripperScaled(Cause):
     remedy = "Calibrate the gripper from shut to open; a percentage is no angle, and another jaw has another range."
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        card, j = reference.card, _gripper(window)
-        assert card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
+        j = _gripper(window)
         if j is None or not _same(window, card):
             return None
         own = _known(window)[:, j]
@@ -237,7 +227,7 @@ class GripperScaled(Cause):
         return Evidence(text, reach, "times", 1.5, likelihood(reach, 1.5, 2.2))
 
 
-class GripperReversed(Cause):
+class GripperReversed(CardCause):
     """Open is shut."""
 
     name = "gripper_reversed"
@@ -247,9 +237,8 @@ class GripperReversed(Cause):
     remedy = "Reverse the gripper: its sign in the calibration, or its two ends, are exchanged."
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        card, j = reference.card, _gripper(window)
-        assert card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
+        j = _gripper(window)
         if j is None or not _same(window, card):
             return None
         own = _known(window)[:, j : j + 1]

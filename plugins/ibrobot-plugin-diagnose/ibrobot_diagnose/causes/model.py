@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import override
+from typing import TYPE_CHECKING, override
 
-from ibrobot_diagnose.cause import Cause, Evidence, Reference, likelihood
+from ibrobot_diagnose.cause import Cause, Evidence, ModelCause, likelihood
 from ibrobot_diagnose.window import Window
 
+if TYPE_CHECKING:
+    from ibrobot_diagnose.ask_again import Examined
 
-class OtherModel(Cause):
+
+class OtherModel(ModelCause):
     """The model does not answer as in the recording."""
 
     name = "other_model"
@@ -20,9 +23,8 @@ class OtherModel(Cause):
     )
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        assert reference.model is not None
-        again = reference.model.again
+    def compare(self, window: Window, model: Examined) -> Evidence | None:
+        again = model.again
         if not again:
             return None
         differing = [each for each in again if not each.equal]
@@ -34,13 +36,13 @@ class OtherModel(Cause):
         text = (
             f"{len(differing)} of {len(again)} answers differ when the model is asked again, by up to {worst:.2g} rad; "
             "the "
-            f"first one is that of {at_s:.2f} s: {reference.model.whose}."
+            f"first one is that of {at_s:.2f} s: {model.whose}."
         )
         strength = likelihood(min(worst, 10.0), 0.01, 0.1)
         return Evidence(text, worst, "rad", 0.01, strength, at_s)
 
 
-class CameraIgnored(Cause):
+class CameraIgnored(ModelCause):
     """The policy does not look at a camera."""
 
     name = "camera_ignored"
@@ -53,9 +55,8 @@ class CameraIgnored(Cause):
     )
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        assert reference.model is not None
-        effects = reference.model.effects
+    def compare(self, window: Window, model: Examined) -> Evidence | None:
+        effects = model.effects
         names = {camera.name for camera in window.cameras.values()}
         of_cameras = {name: [each.largest for each in effects if each.what == name] for name in sorted(names)}
         of_cameras = {name: each for name, each in of_cameras.items() if each}

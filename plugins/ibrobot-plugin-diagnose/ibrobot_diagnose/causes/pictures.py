@@ -11,18 +11,17 @@ from numpy.typing import NDArray
 
 from ibrobot_diagnose.card import (
     CameraCard,
+    Card,
     background_of,
     in_grey,
     numbers_of,
     repeated_of,
     still,
 )
-from ibrobot_diagnose.cause import Cause, Evidence, Reference, Shown, likelihood
+from ibrobot_diagnose.cause import CardCause, Cause, Evidence, Reference, Shown, likelihood
 from ibrobot_diagnose.pictures import Shift, descriptors, nearest, resized, shift_of
 from ibrobot_diagnose.window import Camera, Window
 
-_MOST = 60
-"""Pictures of a camera that are compared."""
 UNSEEN = frozenset({"unseen_pictures", "camera_ignored"})
 
 
@@ -33,18 +32,9 @@ class Pair:
     camera: Camera
     card: CameraCard
 
-    @property
-    def sample(self) -> NDArray[np.float32]:
-        """Some thumbnails of the window, evenly over it, shape (N, 24, 32, 3)."""
-        small = self.camera.small
-        result: NDArray[np.float32] = small[
-            np.unique(np.linspace(0, len(small) - 1, min(_MOST, len(small))).round().astype(int))
-        ]
-        return result
-
     def distance(self, changed: Callable[[Any], Any] = lambda small: small) -> float:
         """Median distance to the nearest thumbnail of the data, of pictures that are changed first."""
-        return float(np.median(nearest(descriptors(changed(self.sample)), self.card.vectors)[0]))
+        return float(np.median(nearest(descriptors(changed(self.camera.sample)), self.card.vectors)[0]))
 
     def beside(self) -> tuple[Shown, ...]:
         """A picture of the run, and the nearest one of the data."""
@@ -59,16 +49,15 @@ class Pair:
         )
 
 
-def pairs(window: Window, reference: Reference) -> Iterator[Pair]:
+def pairs(window: Window, card: Card) -> Iterator[Pair]:
     """The cameras that both have."""
-    assert reference.card is not None
-    for key, card in reference.card.cameras.items():
+    for key, known in card.cameras.items():
         camera = window.cameras.get(key)
         if camera is not None and camera.pictures:
-            yield Pair(camera, card)
+            yield Pair(camera, known)
 
 
-class PictureCause(Cause):
+class PictureCause(CardCause):
     """A cause that looks at each camera alone; the worst one counts."""
 
     needs = frozenset({"pictures", "card pictures"})
@@ -82,8 +71,8 @@ class PictureCause(Cause):
         raise NotImplementedError
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        measured = [(result, pair) for pair in pairs(window, reference) if (result := self.measure(pair)) is not None]
+    def compare(self, window: Window, card: Card) -> Evidence | None:
+        measured = [(result, pair) for pair in pairs(window, card) if (result := self.measure(pair)) is not None]
         if not measured:
             return None
         (number, text), pair = max(measured, key=lambda each: each[0][0])
@@ -91,7 +80,7 @@ class PictureCause(Cause):
         return Evidence(text, number, self.unit, self.threshold, likely, pictures=pair.beside() if likely > 0.4 else ())
 
 
-class CamerasExchanged(Cause):
+class CamerasExchanged(CardCause):
     """Two cameras have each other's place."""
 
     name = "cameras_exchanged"
@@ -107,8 +96,8 @@ class CamerasExchanged(Cause):
     )
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        each = list(pairs(window, reference))
+    def compare(self, window: Window, card: Card) -> Evidence | None:
+        each = list(pairs(window, card))
         best: tuple[float, Pair, Pair] | None = None
         for a in range(len(each)):
             for b in range(a + 1, len(each)):
@@ -238,7 +227,7 @@ class PictureCovered(PictureCause):
 
     @override
     def measure(self, pair: Pair) -> tuple[float, str] | None:
-        middles = [np.median(each, axis=0).mean(axis=2) for each in (pair.sample, pair.card.thumbnails)]
+        middles = [np.median(each, axis=0).mean(axis=2) for each in (pair.camera.sample, pair.card.thumbnails)]
         own, known = (_texture(each) for each in middles)
         rich = known > max(6.0, 0.4 * float(np.median(known)))
         if rich.sum() < 6:

@@ -7,7 +7,8 @@ from typing import override
 import numpy as np
 
 from ibrobot_core.api import NS_PER_S
-from ibrobot_diagnose.cause import Cause, Evidence, Reference, likelihood
+from ibrobot_diagnose.card import Card
+from ibrobot_diagnose.cause import CardCause, Cause, Evidence, Reference, likelihood
 from ibrobot_diagnose.course import course_of
 from ibrobot_diagnose.window import Asked, Floats, Times, Window
 
@@ -182,7 +183,7 @@ class TicksMissed(Cause):
         return Evidence(text, 100 * share, "%", 3.0, likelihood(share, 0.03, 0.12), since)
 
 
-class OtherRate(Cause):
+class OtherRate(CardCause):
     """Chunks are executed at another rate than that of the training."""
 
     name = "other_rate"
@@ -195,10 +196,9 @@ class OtherRate(Cause):
     )
 
     @override
-    def test(self, window: Window, reference: Reference) -> Evidence | None:
-        assert reference.card is not None
+    def compare(self, window: Window, card: Card) -> Evidence | None:
         steps = [each.answer.step_ns for each in window.asked if each.used]
-        rate, trained = NS_PER_S / float(np.median(steps)), reference.card.rate_hz
+        rate, trained = NS_PER_S / float(np.median(steps)), card.rate_hz
         factor = max(rate / trained, trained / rate)
         text = (
             f"The robot executes chunks at {rate:.3g} Hz, but the model's data has {trained:.3g} Hz: it moves "
