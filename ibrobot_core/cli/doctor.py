@@ -50,21 +50,20 @@ def examine(registry: Registry) -> list[Check]:
 def plugin_checks(registry: Registry) -> list[Check]:
     """One check that lists the working plugins, and a failed check per broken plugin."""
     broken = [
-        Check(f"plugin {failure.plugin}", False, str(failure), f"repair or remove it: pip uninstall {failure.package}")
+        Check(f"plugin {failure.plugin}", False, str(failure), f"repair or uninstall the package {failure.package}")
         for failure in registry.failures
     ]
     return [Check("plugins", True, ", ".join(registry.versions())), *broken]
 
 
 def types(registry: Registry) -> list[Check]:
-    """One failed check per installed type that lacks a dependency on this machine, or one check for all."""
-    lacking = [
-        Check(f"{kind} {type_}", False, missing.missing, missing.remedy, matters=False)
-        for kind, type_ in sorted(registry.entries)
-        for missing in (registry.missing(kind, type_),)
-        if missing is not None
-    ]
-    return lacking or [Check("libraries", True, "every installed type has what it needs")]
+    """One failed check per dependency that installed types lack on this machine, or one check for all."""
+    lacking: dict[tuple[str, str], list[str]] = {}
+    for kind, type_ in sorted(registry.entries):
+        if (missing := registry.missing(kind, type_)) is not None:
+            lacking.setdefault((missing.missing, missing.remedy), []).append(f"{kind} {type_}")
+    checks = [Check(", ".join(names), False, *what, matters=False) for what, names in lacking.items()]
+    return checks or [Check("libraries", True, "every installed type has what it needs")]
 
 
 def realtime() -> Check:

@@ -166,7 +166,7 @@ class SectionParser:
                 self._plugin_section(sections, name, value, faults)
             elif (entry := self.registry.entries.get(("section", name))) is not None:
                 reason = f"{entry.package} adds a section of this name, which is one of ibrobot's own"
-                faults.add((name,), f"{reason}: rename it there, or pip uninstall {entry.package}")
+                faults.add((name,), f"{reason}: rename it there, or uninstall that package")
         root, outline = self._with_installed_models(sections), _Outline(self._files)
         sections.plain = outline.arguments(known, root, faults)
         self._report((), faults)

@@ -86,7 +86,7 @@ class Pace:
         if before or not self._slow:
             return ""
         asked_hz = NS_PER_S / self._period_ns
-        return (
-            f"the control loop runs at {share * asked_hz:.0f} Hz instead of {asked_hz:.0f} Hz: reading the joints takes"
-            f" {reading_s * 1e3:.1f} ms of {self._period_ns / 1e6:.1f} ms"
-        )
+        reading = f"reading the joints takes {reading_s * 1e3:.1f} ms of {self._period_ns / 1e6:.1f} ms"
+        if reading_s * NS_PER_S < self._period_ns / 2:
+            reading = f"the machine is busy with other work ({reading}); `ibrobot doctor` says how to get priority"
+        return f"the control loop runs at {share * asked_hz:.0f} Hz instead of {asked_hz:.0f} Hz: {reading}"

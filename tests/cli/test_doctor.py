@@ -43,8 +43,9 @@ def test_what_an_installed_type_lacks_is_noted_with_its_remedy(ibrobot: Ibrobot,
     ran = ibrobot("doctor")
 
     assert (
-        "note  sensor depth: libdepth.so.1 is not there\n      sudo apt-get install libdepth1 libusb-1.0-0\n" in ran.out
-    )
+        "note  sensor depth, sensor far_depth: libdepth.so.1 is not there\n"
+        "      sudo apt-get install libdepth1 libusb-1.0-0\n" in ran.out
+    ), "once for all types that lack it"
     assert (
         "note  sensor odd: its check failed: ZeroDivisionError: one over nothing\n      report it to fake-depth"
         in ran.out
@@ -76,7 +77,7 @@ def test_as_json(ibrobot: Ibrobot, site: Site) -> None:
         "name": "plugin fake_broken",
         "ok": False,
         "found": "plugin 'fake_broken' (fake-broken) failed to import: ImportError: no library",
-        "remedy": "repair or remove it: pip uninstall fake-broken",
+        "remedy": "repair or uninstall the package fake-broken",
         "matters": True,
     }
     assert not found["real-time priority"]["matters"]

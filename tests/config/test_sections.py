@@ -105,7 +105,7 @@ def test_a_section_named_like_one_of_core_is_refused(load_text: Load, base: str,
     registry.entries["section", "executors"] = registry.entries.pop(("section", "around"))
     assert faults(load_text, base) == (
         "robot.yaml:17: executors: ibrobot-plugin-fake adds a section of this name, which is one of ibrobot's own: "
-        "rename it there, or pip uninstall ibrobot-plugin-fake"
+        "rename it there, or uninstall that package"
     )
 
 

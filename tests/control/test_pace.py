@@ -31,6 +31,14 @@ def test_slow_loop_says_so_once_until_it_was_on_time_again():
     assert pace.slow_seconds == 5
 
 
+def test_slow_loop_that_reads_quickly_blames_the_machine():
+    (said,) = run(Pace(PERIOD_NS), 3, 5, 300_000)
+    assert said == (
+        "the control loop runs at 20 Hz instead of 100 Hz: the machine is busy with other work (reading the joints "
+        "takes 0.3 ms of 10.0 ms); `ibrobot doctor` says how to get priority"
+    )
+
+
 def test_single_missed_ticks_are_no_slow_loop():
     pace = Pace(PERIOD_NS)
     for _ in range(100):

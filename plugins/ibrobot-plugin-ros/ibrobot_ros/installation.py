@@ -11,14 +11,14 @@ from pathlib import Path
 
 import attrs
 
-from ibrobot_core.api import MissingDependency
+from ibrobot_core.api import MissingDependency, how_to_install
 from ibrobot_ros.options import RosInstallation
 
 DISTROS = Path("/opt/ros")
 PREFERRED = "jazzy"
 REMEDY = (
     "source a ROS 2 (. /opt/ros/jazzy/setup.bash), or set ros.python or ros.setup; on x86-64 with Python 3.12 "
-    "`uv pip install ros-jazzy-rclpy ros-jazzy-rmw-fastrtps-cpp` brings one without an installation"
+    f"`{how_to_install('ros-jazzy-rclpy', 'ros-jazzy-rmw-fastrtps-cpp')}` brings one without an installation"
 )
 _PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 """Where Fast DDS, the new one and that of Humble, reads its settings from; other middleware ignores them."""

@@ -24,5 +24,6 @@ def unused(options: object, ctx: object) -> Never:
 @hookimpl
 def ibrobot_sensors():
     yield SensorDescriptor("depth", unused, "a depth camera", check=no_library)
+    yield SensorDescriptor("far_depth", unused, "another one", check=no_library)
     yield SensorDescriptor("odd", unused, "an odd one", check=bug)
     yield SensorDescriptor("sound", unused, "needs nothing")
