@@ -134,15 +134,16 @@ def test_power_grows_with_the_number_of_policies():
     assert power(20, 1) == []
 
 
-def test_stated_number_of_trials_finds_a_difference_among_three_policies():
+@pytest.mark.parametrize("tables", [30, pytest.param(200, marks=pytest.mark.long)])
+def test_stated_number_of_trials_finds_a_difference_among_three_policies(tables):
     rng, rates = np.random.default_rng(0), np.array([0.65, 0.5, 0.35])
     number, found = trials_needed(0.3, 3), 0
     assert number is not None
-    for _ in range(200):
+    for _ in range(tables):
         outcomes = rng.random((number, 3)) < rates
         made = compare({name: results(*column) for name, column in zip("abc", outcomes.T, strict=True)}, 0.1)
         found += next(each for each in made if (each.first, each.second) == ("a", "c")).verdict == "better"
-    assert found / 200 > 0.72, "80 %, but for chance"
+    assert found / tables > 0.72, "80 %, but for chance"
 
 
 def trials(*outcomes):

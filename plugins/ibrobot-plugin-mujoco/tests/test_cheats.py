@@ -129,8 +129,9 @@ right one, the right one at a link, nobody."""
 HANDED_OVER = re.compile(r"(?:.*[TA])?[LRBEM]*LM*B[RBEM]*R")
 
 
-def test_every_sequence_of_holders(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All sequences of four; the bar ends in the right place in each."""
+@pytest.mark.parametrize("holders", [3, pytest.param(4, marks=pytest.mark.long)])
+def test_every_sequence_of_holders(monkeypatch: pytest.MonkeyPatch, holders: int) -> None:
+    """The bar ends in the right place in each."""
     suite = TestHandover()
     made = suite.make(suite.context())
     world = suite.world(made, suite.context())
@@ -144,7 +145,7 @@ def test_every_sequence_of_holders(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(handover, "touching", lambda world, body: set(now))
     monkeypatch.setattr("ibrobot_mujoco.scenes.table.touching", lambda world, body: set(now))
     won = 0
-    for sequence in itertools.product(HOLDERS, repeat=4):
+    for sequence in itertools.product(HOLDERS, repeat=holders):
         suite.begin(made, world, 0)
         put(world, "bar", (0.19, -0.2, 0.13))
         for holder in sequence:

@@ -22,7 +22,7 @@ from slow_link import SlowLink
 from ibrobot_core.app import installed_plugins
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]
+FLAGS = ["--no-sandbox", "--disable-3d-apis", "--disable-gpu"]
 pytestmark = [
     pytest.mark.integration,
     pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium"),
