@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from multiprocessing import connection, forkserver
+from multiprocessing import connection, forkserver, resource_tracker
 from multiprocessing.context import ForkServerContext
 from typing import Any, override
 
@@ -98,6 +98,7 @@ class _Worker:
     def __init__(self, context: ForkServerContext) -> None:
         self._connection, theirs = context.Pipe()
         self._process = context.Process(target=_work, args=(theirs, dict(os.environ)), daemon=True)
+        resource_tracker.ensure_running()  # which would unblock Ctrl-C
         with theirs, _deferred_signals():
             forkserver.ensure_running()
             self._process.start()
@@ -172,13 +173,11 @@ def _end_with_parent() -> None:
 @contextmanager
 def _deferred_signals() -> Iterator[None]:
     """Defer Ctrl-C, SIGTERM and SIGHUP; block Ctrl-C in the processes started here, which would print tracebacks."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # Python delivers signals to the main thread alone
-        return
     came: list[int] = []
-    # Any thread may receive them.
-    handlers = {number: signal.signal(number, lambda number, _: came.append(number)) for number in end_signals()}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # child processes inherit it
+    handlers = {}
+    if threading.current_thread() is threading.main_thread():  # Python delivers signals to it alone
+        handlers = {number: signal.signal(number, lambda number, _: came.append(number)) for number in end_signals()}
     try:
         yield
     finally:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import itertools
 import os
+import signal
+import subprocess
+import sys
 from collections.abc import Callable, Generator, Iterable
 from contextlib import closing
 from pathlib import Path
@@ -158,3 +161,35 @@ def test_pool_uses_every_core_by_default(tmp_path: Path, monkeypatch: pytest.Mon
     with closing(open_pool("")) as pool:
         done = list(pool.run([Job(wait, Order(number, str(tmp_path))) for number in range(3)], watch))
     assert sorted(each.result() for each in done) == [0, 1, 2]
+
+
+IN_A_THREAD = """
+import signal
+import threading
+from contextlib import closing
+
+from ibrobot_provenance.jobs import Job, open_pool
+
+
+def blocked(argument, progress):
+    return [int(each) for each in signal.pthread_sigmask(signal.SIG_BLOCK, ())]
+
+
+def run():
+    with closing(open_pool("", 1)) as pool:
+        print([done.value for done in pool.run([Job(blocked, None)])])
+
+
+def main():
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+"""
+
+
+def test_ctrl_c_reaches_no_worker_also_if_a_thread_runs_the_pool(tmp_path: Path) -> None:
+    """Otherwise each would print a traceback."""
+    (tmp_path / "in_a_thread.py").write_text(IN_A_THREAD)
+    command = (sys.executable, "-c", "import in_a_thread; in_a_thread.main()")
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout == f"[[{int(signal.SIGINT)}]]\n", done.stderr
