@@ -246,7 +246,10 @@ def _document(path: Path, tool: str | None = None) -> tuple[str, Any]:
         text = path.read_text()
         return text, json.loads(text, object_pairs_hook=_once)
     except FileNotFoundError:
-        remedy = f"`{tool} calibrate` makes one" if tool else "calibrate with the command of the hardware's plugin"
+        remedy = "calibrate with the command of the hardware's plugin"
+        if tool:
+            name = path.stem if path == calibration_path(path.stem) else path
+            remedy = f"`{tool} calibrate --name {name}` makes one"
         raise CalibrationError(f"{path}: there is no such calibration; {remedy}") from None
     except json.JSONDecodeError as error:
         raise CalibrationError(f"{path}:{error.lineno}: not JSON: {error.msg}") from None

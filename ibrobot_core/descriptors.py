@@ -82,6 +82,8 @@ class Descriptor[T]:
     calibration: Callable[[Any], str | None] = _answer(None)
     """Name or path of the calibration in the options, for `load_calibration`; recordings contain that of hardware. None
     without a calibration."""
+    tool: str | None = attrs.field(default=None, kw_only=True)
+    """The command that has `calibrate` and `import` for its calibrations, for messages, e.g. `ibrobot feetech`."""
     offers: Callable[[Any, str], bool] = _answer(False)
     """Whether other programs can call a service of the run, by its name, through a component with these options."""
     default: bool = attrs.field(default=False, kw_only=True)
@@ -119,7 +121,7 @@ class HardwareDescriptor(Descriptor["interfaces.Hardware"]):
 
     def kept(self, options: Any) -> Mapping[str, Any]:
         """Its calibration and its anchored joints."""
-        return {"calibration": self.calibration(options), "anchored": self.anchored(options)}
+        return {"calibration": self.calibration(options), "tool": self.tool, "anchored": self.anchored(options)}
 
 
 @attrs.frozen
@@ -155,7 +157,7 @@ class TeleopDescriptor(Descriptor["interfaces.Teleop"]):
 
     def kept(self, options: Any) -> Mapping[str, Any]:
         """Its calibration."""
-        return {"calibration": self.calibration(options)}
+        return {"calibration": self.calibration(options), "tool": self.tool}
 
 
 @attrs.frozen

@@ -34,6 +34,8 @@ class HardwareConfig(NamedComponentConfig):
     joints: tuple[str, ...] = option((), help="its joints; a single component may omit them and owns all")
     calibration: str | None = not_a_key(None)
     """Name or path of the calibration."""
+    tool: str | None = not_a_key(None)
+    """The command that makes it."""
     anchored: tuple[str, ...] = not_a_key(())
     """Joints whose calibrated closed end is their lower limit."""
 
@@ -105,6 +107,8 @@ class TeleopConfig(NamedComponentConfig):
 
     calibration: str | None = not_a_key(None)
     """Name or path of the calibration."""
+    tool: str | None = not_a_key(None)
+    """The command that makes it."""
 
 
 @attrs.frozen

@@ -87,7 +87,9 @@ def test_files_that_are_none_are_refused(tmp_path: Path, text: str, message: str
 
 
 def test_a_missing_file_says_how_to_make_one(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match=r"no such calibration; `ibrobot arm calibrate` makes one"):
+    with pytest.raises(
+        CalibrationError, match=r"no such calibration; `ibrobot arm calibrate --name \S+/arm.json` makes one"
+    ):
         load_calibration(tmp_path / "arm.json", tool="ibrobot arm")
     with pytest.raises(
         CalibrationError, match="no such calibration; calibrate with the command of the hardware's plug"

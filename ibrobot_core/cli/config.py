@@ -90,6 +90,6 @@ def _uncalibrated(config: RobotConfig) -> Iterator[Problem]:
         try:
             if part.calibration is not None:
                 joints = part.joints if isinstance(part, HardwareConfig) else None
-                load_calibration(part.calibration, joints).check_ranges(limits, config.closed_ends)
+                load_calibration(part.calibration, joints, tool=part.tool).check_ranges(limits, config.closed_ends)
         except CalibrationError as error:
             yield Problem(config.source, 0, path, str(error))

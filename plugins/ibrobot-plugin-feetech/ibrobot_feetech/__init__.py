@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from ibrobot_core.api import Check, HardwareDescriptor, Late, SensorDescriptor, TeleopDescriptor, hookimpl
 from ibrobot_core.app import Command, GuideDescriptor, PanelDescriptor
 from ibrobot_feetech.options import (
+    TOOL,
     EmulatedSignalOptions,
     FollowerOptions,
     LeaderOptions,
@@ -75,6 +76,7 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
         check_options=check_follower,
         devices=serial_port,
         calibration=lambda options: options.calibration,
+        tool=TOOL,
         anchored=lambda options: options.anchored,
     )
 
@@ -102,6 +104,7 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         check_options=check_leader,
         devices=serial_port,
         calibration=lambda options: options.calibration,
+        tool=TOOL,
         keys=leader_keys,
         label="follow the leader arm",
         needs_terminal=lambda options: options.deadman != "none",

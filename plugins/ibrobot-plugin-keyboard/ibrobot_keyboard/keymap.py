@@ -40,11 +40,12 @@ class Keymap:
         actions = {**(self.joints if mode == "joints" else self.cartesian), **self.common}
         return next((action for action, its_key in actions.items() if its_key == key), None)
 
-    def help(self) -> str:
-        """A compact table."""
-        lines = [f"joints     {_pairs(self.joints)}"]
+    def help(self, mode: str = "joints") -> str:
+        """A compact table; keys that do not act in the mode, `joints` or `cartesian`, say what to press first."""
+        after = f"  (after {self.common['toggle']})" if self.cartesian else ""
+        lines = [f"joints     {_pairs(self.joints)}{after if mode != 'joints' else ''}"]
         if self.cartesian:
-            lines.append(f"Cartesian  {_pairs(self.cartesian)}")
+            lines.append(f"Cartesian  {_pairs(self.cartesian)}{after if mode == 'joints' else ''}")
         if self.keyless:
             joint = self.keyless[0]
             lines.append(

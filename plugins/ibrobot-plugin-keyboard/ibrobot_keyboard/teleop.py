@@ -113,7 +113,7 @@ class KeyboardTeleop(Teleop):
 
     @override
     def help(self) -> str:
-        return self._keymap.help()
+        return self._keymap.help(self._mode)
 
     def _take(self, event: KeyEvent, action: str, now_ns: int) -> None:
         if action in _SETTINGS:

@@ -102,7 +102,9 @@ def test_the_toggle_key_changes_between_joints_and_tool(robot):
 
     joint = hold("w")
     assert np.count_nonzero(joint - rest) == 1
+    assert [line.endswith("  (after m)") for line in teleop.help().splitlines()] == [False, True, False]
     jogged_tool = hold("m", "w", "o")
+    assert [line.endswith("  (after m)") for line in teleop.help().splitlines()] == [True, False, False]
     way = tool(robot, jogged_tool)[0] - tool(robot, rest)[0]
     np.testing.assert_allclose(way, [0.008, 0, 0], atol=1.5e-3)  # it speeds up first
     assert jogged_tool[-1] - rest[-1] == pytest.approx(0.1)

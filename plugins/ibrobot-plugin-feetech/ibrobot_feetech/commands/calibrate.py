@@ -37,7 +37,9 @@ class Calibrate(OnPort):
     name: str | None = option(
         None, help="name of the calibration, or a path; by default so101_follower, or so101_leader"
     )
-    leader: bool = option(False, help="a leader arm, whose gripper has a different range")
+    leader: bool = option(
+        False, help="a leader arm, whose gripper has a different range; default if --name ends in leader"
+    )
     robot: str | None = option(None, typed="--robot CONFIG", help="robot YAML with the joints; by default an SO-101")
     arm: str | None = option(None, help="name of the arm, for the records; by default the adapter's serial number")
     full_turn: tuple[str, ...] = option(FULL_TURN, help="joint that can make a full turn")
@@ -54,10 +56,10 @@ class Calibrate(OnPort):
     yes: bool = option(False, help="switch torque off and overwrite without asking; the old file is kept")
 
     def __call__(self) -> None:
+        name = self.name or ("so101_leader" if self.leader else "so101_follower")
         calibrate_arm(
-            TerminalGuide(), self.port, self.name or ("so101_leader" if self.leader else "so101_follower"),
-            leader=self.leader, robot=self.robot, arm=self.arm, full_turn=self.full_turn, zero_at=self.zero_at,
-            prefix=self.prefix, yes=self.yes,
+            TerminalGuide(), self.port, name, leader=self.leader or name.endswith("leader"), robot=self.robot,
+            arm=self.arm, full_turn=self.full_turn, zero_at=self.zero_at, prefix=self.prefix, yes=self.yes,
             answers=Answers(self.middle_now, self.range_seconds, self.accept_ranges, self.check_signs),
         )  # fmt: skip
 
