@@ -93,6 +93,12 @@ class ActiveExecutors:
             self._report_goals(owned)
         return setpoints
 
+    def note_guard(self, overruled: str, changed: NDArray[np.bool_]) -> None:
+        """Tell the executors of changed joints, shape (J,), what the guard kept them from."""
+        for owned in self._active:
+            if changed[owned.columns].any():
+                owned.executor.note_guard(overruled)
+
     def set_goal(self, executor: str, goal_id: str, goal: ExecutorGoal, measured: JointReading) -> None:
         """Pass a goal to an executor.
 

@@ -194,10 +194,15 @@ class ControlCore:
         self._check_following()
         self._check_health()
         measured = self._readings.newest
-        command = self._safety.apply(self._desired(), measured.position)
+        desired = self._desired()
+        command = self._safety.apply(desired, measured.position)
+        if self._safety.overruled and desired is not None:
+            self._executors.note_guard(self._safety.overruled, command != desired)
         if (overruled := self._safety.overruled) != self._overruled:
             self._overruled = overruled
             self.events.append({"event": "guard", "overruled": overruled})
+        if self._safety.guard_fault:
+            self._raise_fault(self._safety.guard_fault)
         self._write(command)
         self._hardware.advance(periods * self.period_ns)
         self._tick += 1

@@ -74,8 +74,8 @@ class SafetyLayer:
         self._estopped = False
         self._active = False
         self._guard = guard
-        self.overruled = ""
-        """As of the guard, in the last tick."""
+        self.overruled = self.guard_fault = ""
+        """As of the guard, and how it failed, in the last tick."""
 
     def activate(self, measured: Vector) -> None:
         """Start at rest from the measured positions [rad], shape (J,). Call it again when torque returns.
@@ -119,7 +119,7 @@ class SafetyLayer:
         seen = self._nothing if seen is None else seen
         known = np.isfinite(seen)
         lower, upper = self._bounds(seen, known)
-        self.overruled = ""
+        self.overruled = self.guard_fault = ""
         if wanted is None:
             self._events["missing" if desired is None else "wrong_length"] += 1
             command = self._next(self._nothing, np.zeros(len(self._names), dtype=bool), lower, upper)
@@ -256,8 +256,12 @@ class SafetyLayer:
         self, guard: Guard, before: Vector, step: Vector, limited: Vector, seen: Vector, low: Vector, high: Vector
     ) -> Vector:
         """The command of the guard [rad], shape (J,): between that of the limits and braking, whatever it returns."""
-        accepted = _vector(guard.accept(before, step / self._period_s, limited, seen), len(before))
-        self.overruled = guard.overruled
+        accepted = None
+        try:
+            accepted = _vector(guard.accept(before, step / self._period_s, limited, seen), len(before))
+            self.overruled = guard.overruled
+        except Exception as error:  # noqa: BLE001 - a plugin's bug must neither end the loop nor let a command through
+            self.guard_fault = f"control.guard fails: {type(error).__name__}: {error}"
         if accepted is None or not np.array_equal(accepted, limited):
             brakes = before + _limited(np.zeros_like(step), step - self._change, step + self._change)
             usable = brakes if accepted is None else np.where(np.isfinite(accepted), accepted, brakes)

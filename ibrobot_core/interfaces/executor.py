@@ -135,6 +135,9 @@ class Executor(ABC):
     def cancel(self, measured: JointReading) -> None:
         """Cancel the present goal, if any, and hold the measured position."""
 
+    def note_guard(self, overruled: str) -> None:
+        """Called after a tick in which the guard changed the setpoint, with what it was about to touch; see `Guard`."""
+
     def pop_status(self) -> GoalStatus | None:
         """The next unreported change of a goal's state, or None."""
         return None

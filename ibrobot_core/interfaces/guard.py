@@ -25,7 +25,8 @@ class Guard(ABC):
     def accept(self, position: Vector, velocity: Vector, setpoint: Vector, measured: Vector) -> Vector:
         """The command of this tick [rad], shape (J,), in place of `setpoint`.
 
-        The safety layer brings it between `setpoint`, which is within all limits, and braking.
+        The safety layer brings it between `setpoint`, which is within all limits, and braking. An error of a plugin is
+        a fault: the robot brakes, and holds until a reset.
 
         Args:
             position: the last command [rad], shape (J,).

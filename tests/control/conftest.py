@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, override
 
@@ -131,11 +131,12 @@ class ScriptedHardware(FakeHardware):
 class Rig:
     """A control core with its clock and its hardware."""
 
-    def __init__(self, edits: Mapping[str, Any], *, sim: bool = False) -> None:
+    def __init__(self, edits: Mapping[str, Any], *, sim: bool = False, entries: Sequence[Entry] = ()) -> None:
         self.parts: dict[str, ScriptedHardware] = {}
         self.clock = SteppedClock(START_NS)
         document = yaml.safe_load(DOCUMENT) | dict(edits)
         registry = self._registry()
+        registry.entries.update({(entry.kind, entry.descriptor.type): entry for entry in entries})
         self.config: RobotConfig = from_document(document, source=Path("mini.yaml"), sim=sim, registry=registry)
         self.core: ControlCore = build_core(self.config, registry, self.clock, 0)
 

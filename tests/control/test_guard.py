@@ -11,9 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ibrobot_core.api import Joint, Robot
+from ibrobot_core.api import Descriptor, Joint, Robot
+from ibrobot_core.control.commands import ClearFaults
 from ibrobot_core.control.safety import SafetyLayer
-from ibrobot_core.interfaces import Guard
+from ibrobot_core.interfaces import Executor, Guard
+from ibrobot_core.plugins import Entry
 
 PERIOD_S = 0.01
 ROBOT = Robot(
@@ -23,13 +25,16 @@ ROBOT = Robot(
 )
 
 
+LABEL = '{"first": "x", "second": "y", "distance": 0.01}'
+
+
 class Says(Guard):
     """A guard that returns what a function makes of the setpoint."""
 
     def __init__(self, say: Callable[[np.ndarray], Any]) -> None:
         self.say = say
         self.seen: list[tuple[np.ndarray, ...]] = []
-        self.overruled = '{"first": "x", "second": "y", "distance": 0.01}'
+        self.overruled = LABEL
 
     def accept(self, position, velocity, setpoint, measured):
         self.seen.append((position, velocity, setpoint, measured))
@@ -105,3 +110,73 @@ def test_braking_asks_no_guard(brake) -> None:
     layer.apply(None, np.zeros(2))
     assert guard.seen == []
     assert layer.overruled == ""
+
+
+class Broken(Exception):
+    """What a plugin's bug may raise."""
+
+
+@pytest.mark.parametrize("error", [ValueError("nothing near"), ZeroDivisionError(), IndexError("5"), Broken("x")])
+def test_an_error_of_a_guard_brakes_and_lets_no_command_through(error: Exception) -> None:
+    guard = Says(lambda setpoint: setpoint)
+    layer = SafetyLayer(ROBOT, 10_000_000, guard)
+    layer.activate(np.zeros(2))
+    for _ in range(20):
+        at = layer.apply(np.array([1.0, 0.0]), layer.current)
+    rest = layer.rest
+
+    def fail(setpoint: np.ndarray) -> None:
+        raise error
+
+    guard.say = fail
+    for _ in range(20):
+        at = layer.apply(np.array([1.0, 0.0]), at)
+        assert layer.guard_fault == f"control.guard fails: {type(error).__name__}: {error}"
+    assert at == pytest.approx(rest, abs=1e-9)
+    guard.say = lambda setpoint: setpoint
+    assert layer.apply(at, at) == pytest.approx(at)
+    assert layer.guard_fault == ""
+
+
+class TestInControl:
+    """A control core with a guard."""
+
+    @pytest.fixture
+    def rig(self, make_rig):
+        self.guard = Says(lambda setpoint: setpoint)
+        self.guard.overruled = ""
+        entry = Entry("guard", Descriptor("says", lambda options, ctx: self.guard, "says"), "fake", "fake", "1.0")
+        return make_rig({"control": {"guard": {"type": "says"}}}, entries=[entry])
+
+    def test_an_error_of_the_guard_is_a_fault_that_holds_until_a_reset(self, rig) -> None:
+        rig.start()
+        rig.plan([0.8, 0.8, 0.8])
+        rig.tick(20)
+
+        def fail(setpoint: np.ndarray) -> None:
+            raise KeyError("wall")
+
+        self.guard.say = fail
+        rig.tick(30)
+        assert rig.core.fault == "control.guard fails: KeyError: 'wall'"
+        at = rig.tick().command
+        np.testing.assert_array_equal(rig.tick(10).command, at)
+        assert at[0] < 0.5
+        rig.assert_within_limits()
+        self.guard.say = lambda setpoint: setpoint
+        rig.call(ClearFaults())
+        rig.plan([0.5, 0.5, 0.5])
+        assert rig.tick(80).command == pytest.approx(0.5)
+
+    def test_executors_of_changed_joints_learn_what_held_them_back(self, rig, monkeypatch) -> None:
+        noted = []
+        monkeypatch.setattr(Executor, "note_guard", lambda self, overruled: noted.append((self.joints, overruled)))
+        rig.start()
+        rig.plan([0.8, 0.8, 0.8])
+        rig.tick(5)
+        assert noted == []
+        self.guard.overruled = LABEL
+        at = rig.core.state.command
+        self.guard.say = lambda setpoint: np.array([at[0], at[1], setpoint[2]])
+        rig.tick()
+        assert noted == [(("pan", "lift"), LABEL)]

@@ -125,6 +125,27 @@ def test_where_stalling_is_not_allowed_it_aborts_and_holds_the_measured_position
     assert jaw.setpoint == 0.6
 
 
+@pytest.mark.parametrize("allowed", [True, False])
+def test_what_the_guard_holds_back_is_no_grasp(allowed: bool) -> None:
+    jaw = Jaw(start=1.0, blocked_at=0.6, velocity=2.0, stall_time=0.2, allow_stalling=allowed)
+    jaw.close(0.0)
+    for _ in range(60):
+        jaw.executor.note_guard('{"first": "finger", "second": "wall", "distance": 0.0031}')
+        jaw.run(0.01)
+    status = jaw.statuses()[-1]
+    assert (status.state, status.message) == (GoalState.ABORTED, "the guard: finger was 3.1 mm from wall")
+    assert jaw.setpoint == pytest.approx(0.6), "it does not squeeze"
+
+
+def test_a_grasp_that_the_guard_keeps_from_squeezing_more_is_one() -> None:
+    jaw = Jaw(start=1.0, blocked_at=0.6, velocity=2.0, stall_time=0.2)
+    jaw.close(0.0)
+    for _ in range(60):
+        jaw.executor.note_guard('{"first": "cube", "second": "finger", "distance": -0.0098}')
+        jaw.run(0.01)
+    assert jaw.statuses()[-1].state == GoalState.SUCCEEDED
+
+
 def test_a_slow_gripper_that_moves_does_not_stall() -> None:
     jaw = Jaw(start=1.0, velocity=0.05, stall_velocity=0.01, stall_time=0.1)
     jaw.close(0.9)

@@ -538,3 +538,42 @@ def test_what_is_given_out_is_the_callers_to_change() -> None:
     for time_s in (0.5, 1.0, 1.1, 1.2):
         arm.executor.update(JointReading(ns(time_s), np.array([1.0, 0.0]), np.zeros(2), np.zeros(2)))[:] = 9.0
     assert arm.at(1.3) == [1.0, 0.0]
+
+
+class TestGuard:
+    """What the guard holds back is not reached: the goal ends, and says why."""
+
+    LABEL = '{"first": "hand", "second": "wall", "distance": 0.0031}'
+
+    def hold_back(self, arm: Arm, ticks: int, label: str = LABEL) -> None:
+        for _ in range(ticks):
+            arm.executor.note_guard(label)
+            arm.at(arm.now_ns / 1e9 + 0.01)
+
+    @pytest.mark.parametrize("at_s", [0.1, 0.5, 0.9])
+    def test_a_trajectory_that_it_holds_back_is_aborted_with_the_pair(self, at_s: float) -> None:
+        arm = Arm()
+        arm.go(goal(point(2.0, (0.5, 0.5))))
+        arm.at(at_s)
+        self.hold_back(arm, 19)
+        assert [each.state for each in arm.statuses()] == [GoalState.EXECUTING]
+        arm.off = np.array([-0.02, 0.0])
+        before = arm.setpoint + arm.off
+        self.hold_back(arm, 1)
+        assert arm.statuses() == [GoalStatus("goal", GoalState.ABORTED, "the guard: hand was 3.1 mm from wall")]
+        assert arm.setpoint == pytest.approx(before), "it holds where the arm is"
+
+    def test_a_stale_world_is_named(self) -> None:
+        arm = Arm()
+        arm.go(goal(point(2.0, (0.5, 0.5))))
+        self.hold_back(arm, 20, '{"first": "world", "second": "cloud top is 2 s old", "distance": null}')
+        assert arm.statuses()[-1].message == "the guard: world: cloud top is 2 s old"
+
+    def test_a_short_hold_passes(self) -> None:
+        arm = Arm()
+        arm.go(goal(point(1.0, (0.5, 0.5))))
+        for _ in range(4):
+            self.hold_back(arm, 19)
+            arm.at(arm.now_ns / 1e9 + 0.01)
+        arm.at(1.5)
+        assert arm.statuses()[-1].state == GoalState.SUCCEEDED

@@ -26,6 +26,7 @@ from ibrobot_core.api import (
     seconds,
 )
 from ibrobot_planning.executors.options import GripperOptions
+from ibrobot_planning.guard_label import in_words, touches
 
 _STRONGEST = 1000.0
 """Largest `max_effort` of a goal [Nm]; 0 stands for no limit."""
@@ -50,8 +51,9 @@ class GripperExecutor(Executor):
     Reached: the measured position is within `goal_tolerance` of the goal. Stalled: the measured speed has been below
     `stall_velocity` for `stall_time`; something is in the way. With `allow_stalling` that is a success (grasped) and
     the setpoint goes on to the goal, so that the gripper keeps squeezing; without it, the goal is aborted and the
-    measured position held, as by `cancel`. The goal `SlowDown` slows down and holds. With `max_effort` the
-    setpoint stays while the measured effort is at or above it, also after the goal has ended.
+    measured position held, as by `cancel`; so it is if the guard holds it back before it touches. The goal `SlowDown`
+    slows down and holds. With `max_effort` the setpoint stays while the measured effort is at or above it, also after
+    the goal has ended.
     """
 
     def __init__(self, options: GripperOptions, ctx: Context) -> None:
@@ -77,6 +79,8 @@ class GripperExecutor(Executor):
         self._stamp_ns = 0
         self._running: _Running | None = None
         self._statuses: deque[GoalStatus] = deque()
+        self._held_back = ""
+        """What the guard kept the last setpoint from."""
 
     @override
     def activate(self, measured: JointReading) -> None:
@@ -141,7 +145,12 @@ class GripperExecutor(Executor):
         self._stamp_ns = measured.stamp_ns
         if self._running is not None:
             self._judge(self._running, measured, passed_ns)
+        self._held_back = ""
         return np.array([self._setpoint])
+
+    @override
+    def note_guard(self, overruled: str) -> None:
+        self._held_back = "" if touches(overruled) else overruled
 
     @override
     def cancel(self, measured: JointReading) -> None:
@@ -175,7 +184,10 @@ class GripperExecutor(Executor):
         elif running.still_ns >= self._stall_ns:
             result = self._result(measured, stalled=True)
             why = f"stalled at {measured.position[0]:.4g} rad on the way to {self._target:.6g}"
-            if self._options.allow_stalling:
+            if self._held_back:  # it stands before something that it does not touch
+                self._hold(measured)
+                self._end(GoalState.ABORTED, f"the guard: {in_words(self._held_back)}", result)
+            elif self._options.allow_stalling:
                 self._end(GoalState.SUCCEEDED, why, result)
             else:
                 self._hold(measured)

@@ -21,6 +21,7 @@ from ibrobot_core.api import (
     JointReading,
     SlowDown,
     Vector,
+    ns,
     seconds,
 )
 from ibrobot_core.app import Spline
@@ -31,13 +32,14 @@ from ibrobot_planning.executors.trajectory_goal import (
     check_positions,
     check_trajectory,
 )
+from ibrobot_planning.guard_label import in_words
 
 LAG_S = 0.1
 """Longest lag of a joint behind its setpoint [s], as in ADR 16."""
 START_TOLERANCE_RAD = 0.1
 """How far from the present setpoint a trajectory's point at time zero may lie."""
-
-
+_HELD_BACK_S = 0.2
+"""How long the guard may hold a trajectory back without a break until it is aborted [s]."""
 _ROUNDING_RAD = 1e-9
 """Largest rounding error of a trajectory's polynomials at its points."""
 _STOP_SHARE = 0.8
@@ -71,7 +73,8 @@ class TrajectoryExecutor(Executor):
     so that a new goal replaces a running one without a step. A point at time zero must lie near the setpoint, which
     replaces it. The last point is held. Success: the measured position comes within the goal tolerance, at the end or
     up to `goal_time` after it. A joint further off its path than the path tolerance plus a servo's lag of 0.1 s, or
-    late at the goal, aborts it. Aborting and cancelling hold the measured position.
+    late at the goal, aborts it; so does a guard that holds it back for 0.2 s. Aborting and cancelling hold the
+    measured position.
 
     A trajectory with `takes_over` begins at a given time of the running one, with its setpoint, velocity and
     acceleration at that time. The goal `SlowDown` slows down along the trajectory under way, within the
@@ -94,6 +97,8 @@ class TrajectoryExecutor(Executor):
         self._now_ns = self._stamp_ns = 0
         """Time, advanced by at most a period per tick, and the time of the last tick."""
         self._statuses: deque[GoalStatus] = deque()
+        self._held_back, self._held_back_ns = "", 0
+        """What the guard kept the last setpoint from, and for how long without a break [ns]."""
 
     @override
     def activate(self, measured: JointReading) -> None:
@@ -174,6 +179,8 @@ class TrajectoryExecutor(Executor):
         setpoint, velocity, _ = self._sample(self._now_ns)
         setpoint = self._without_rounding(setpoint)
         running = self._running
+        held_back, self._held_back = self._held_back, ""
+        self._held_back_ns = self._held_back_ns + self._period_ns if held_back else 0
         if running is None:
             return setpoint.copy()
         error = np.abs(setpoint - measured.position)
@@ -181,11 +188,11 @@ class TrajectoryExecutor(Executor):
             self._held = setpoint.copy()
             self._end(GoalState.SUCCEEDED, "")
             return setpoint.copy()
-        if stop is not None or self._now_ns < running.spline.end_ns:
+        is_held_back = self._held_back_ns >= ns(_HELD_BACK_S)
+        if is_held_back or stop is not None or self._now_ns < running.spline.end_ns:
             beyond = _exceeds(error - LAG_S * np.abs(velocity), running.goal.path_tolerance)
-            if beyond.any():
-                why = self._deviation(beyond, error, running.goal.path_tolerance, "off its path")
-                why += f", beyond a lag of {LAG_S} s"
+            if is_held_back or beyond.any():
+                why = f"the guard: {in_words(held_back)}" if is_held_back else self._off_path(beyond, error, running)
                 return self._stop(GoalState.ABORTED, why, measured, {"exceeded": "path"})
             return setpoint
         beyond = _exceeds(error, running.goal.goal_tolerance)
@@ -197,6 +204,10 @@ class TrajectoryExecutor(Executor):
             late = f"{why} {seconds(running.goal.goal_time_ns):.6g} s after the end"
             return self._stop(GoalState.ABORTED, late, measured, {"exceeded": "goal"})
         return setpoint.copy()
+
+    @override
+    def note_guard(self, overruled: str) -> None:
+        self._held_back = overruled
 
     @override
     def cancel(self, measured: JointReading) -> None:
@@ -289,6 +300,10 @@ class TrajectoryExecutor(Executor):
         if self._running is not None:
             self._statuses.append(GoalStatus(self._running.goal_id, state, message, result or {}))
             self._running = None
+
+    def _off_path(self, beyond: NDArray[np.bool_], error: Vector, running: _Running) -> str:
+        why = self._deviation(beyond, error, running.goal.path_tolerance, "off its path")
+        return f"{why}, beyond a lag of {LAG_S} s"
 
     def _deviation(self, beyond: NDArray[np.bool_], error: Vector, tolerance: Vector, what: str) -> str:
         joint = int(beyond.argmax())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import deque
 from collections.abc import Mapping
 from typing import Any, override
@@ -17,6 +16,7 @@ from ibrobot_core.app import Guard
 from ibrobot_planning.guard.changes import WorldChange
 from ibrobot_planning.guard.options import ClearanceGuardOptions
 from ibrobot_planning.guard.pairs import Indices, Pairs
+from ibrobot_planning.guard_label import label
 from ibrobot_planning.world.arm import Arm, Pair, sorted_pair
 from ibrobot_planning.world.checked_arm import may_touch_arm
 from ibrobot_planning.world.objects import FLOOR, Plane, World, WorldObject
@@ -98,7 +98,7 @@ class ClearanceGuard(Guard):
         self._pair = ()
         if self._stale and self._options.when_stale == "hold" and not np.array_equal(setpoint, brakes):
             self._counts["stale"] += 1
-            self.overruled = json.dumps({"first": "world", "second": self._stale, "distance": None})
+            self.overruled = label("world", self._stale, None)
             return brakes
         extra = self._pairs.levers @ self._away
         blocking = self._blocking(position, setpoint, extra)
@@ -108,8 +108,8 @@ class ClearanceGuard(Guard):
         nearest = int(blocking[self._pairs.distances(position, blocking).argmin()])
         self._pair = self._pairs.names[nearest]
         if self._pair != before:
-            distance = round(float(self._pairs.distances(position, np.array([nearest]))[0]), 4)
-            self._label = json.dumps({"first": self._pair[0], "second": self._pair[1], "distance": distance})
+            alike = np.flatnonzero([names == self._pair for names in self._pairs.names])
+            self._label = label(*self._pair, float(self._pairs.distances(position, alike).min()))
         self.overruled = self._label
         lowest, highest = np.minimum(brakes, setpoint), np.maximum(brakes, setpoint)
         for _ in range(_ROUNDS):
