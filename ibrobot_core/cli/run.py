@@ -351,11 +351,11 @@ def _print_summary(runtime: Runtime, hooks: RunHooks, as_json: bool) -> None:
     loop = summary["loop"]
     echo(f"{summary['robot']}: {summary['mode']} for {summary['duration_s']:.1f} s")
     judged, unjudged = summary["episodes"], summary["unjudged"]
-    if judged or unjudged:
+    if judged or (unjudged and runtime.session.config.control_modes[summary["mode"]].inference is not None):
         more = f", {unjudged} not judged" if unjudged else ""
         echo(f"episodes   {judged + unjudged}, of which {summary['successes']} succeeded{more}")
-    if summary["disturbed"]:
-        echo(f"disturbed  {summary['disturbed']} episodes, by a fault or an emergency stop")
+        if summary["disturbed"]:
+            echo(f"disturbed  {summary['disturbed']} episodes, by a fault or an emergency stop")
     if summary["lockstep"]:
         echo(f"loop       {loop['ticks']} ticks in lockstep")
     elif loop["ticks"]:

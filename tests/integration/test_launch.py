@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from command_line import run_here
 
 if TYPE_CHECKING:
     from tests.integration.conftest import Log, Ran
@@ -52,6 +53,16 @@ def test_an_episode_that_fails_is_exit_code_3(launch: Callable[..., Ran]):
     ran = launch("--lockstep", "--episodes", "1", "--set", "contract.max_duration_s=1")
     assert ran.code == 3, ran.err
     assert (ran.summary["episodes"], ran.summary["successes"]) == (1, 0)
+
+
+@pytest.mark.parametrize(("mode", "has_episodes"), [("moveit_planning", False), ("model_inference", True)])
+def test_only_a_run_of_a_policy_counts_episodes_that_nothing_judged(mode: str, has_episodes: bool):
+    goal = ("--goal", "rest") if mode == "moveit_planning" else ()
+    done = run_here("launch", "so101_blind", "--sim", "--lockstep", "--headless", "--duration", "1",
+                    "--mode", mode, *goal)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert ("\nepisodes   1, of which 0 succeeded, 1 not judged\n" in done.stdout) == has_episodes
+    assert ("\nepisodes " in done.stdout) == has_episodes
 
 
 def test_a_fault_is_named_and_the_run_holds_until_its_end(recorded: Callable[..., tuple[Ran, list[Log]]]):

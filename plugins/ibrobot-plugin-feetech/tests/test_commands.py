@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from click.testing import CliRunner
 from ibrobot_feetech.commands.joints import Joint, joints_of
 from ibrobot_feetech.commands.ranges import Range, doubtful
 from ibrobot_feetech.emulator import EmulatedServo, Emulator
+from ibrobot_feetech.options import TOOL
 from ibrobot_testing import terminal as terminal_module
 from ibrobot_testing.command import command_line
 
@@ -148,6 +150,21 @@ def test_an_arm_is_calibrated_in_the_dialogue_and_the_former_file_is_kept(emulat
     code, screen = ran("check", emulator.port, "--write", "--yes", before=adapter.replace("5A12", "5A99"))
     assert code == 1
     assert "this is another arm: its adapter has the USB serial number 5A99" in screen.replace("\r\n", " ")
+
+
+@pytest.mark.parametrize("name", ["so101_follower", "so101_leader"])
+def test_the_command_that_a_missing_calibration_names_makes_it(emulator, person, home, name):
+    with pytest.raises(CalibrationError) as missing:
+        load_calibration(name, JOINTS, tool=TOOL)
+    (command,) = re.findall(r"`ibrobot (.*?)`", str(missing.value))
+    gripper_of_a_leader = {6: (1400, 1700)} if name == "so101_leader" else {}  # hardly half the follower's range
+    with Terminal(*command.split(), emulator.port, "--middle-now") as terminal:
+        terminal.wait_for("(Enter ends it)")
+        person.sweep(ENDS | gripper_of_a_leader)
+        terminal.type("\r")
+        terminal.wait_for("written to servos")
+        assert terminal.end() == 0
+    load_calibration(name, JOINTS)
 
 
 QUESTIONS = ("Calibrate again?", "Go on?", "Then press Enter", "(Enter ends it)")
