@@ -167,6 +167,28 @@ def test_the_command_that_a_missing_calibration_names_makes_it(emulator, person,
     load_calibration(name, JOINTS)
 
 
+def test_an_arm_whose_adapter_was_replaced_is_known_after_the_command_that_the_error_names(
+    emulator, home, calibration_file
+):
+    before = ADAPTER.format(port=emulator.port)
+    run = ("check", emulator.port, "--name", str(calibration_file))
+    assert ran("import", str(calibration_file), "--port", emulator.port, "--yes", before=before)[0] == 0
+    assert ran(*run, "--write", "--yes", before=before)[0] == 0
+    replaced = before.replace("5A12", "5A99")
+    with Terminal("feetech", *run, before=replaced, columns=400) as terminal:
+        assert terminal.end() == 1
+        (remedy,) = re.findall(r"`ibrobot feetech (import .*?)` stores the new one", terminal.screen)
+    assert ran(*remedy.split(), before=replaced)[0] == 0
+    assert ran(*run, before=replaced)[0] == 0
+
+
+def test_a_terminal_without_a_person_lists_the_ports(tmp_path):
+    (tmp_path / "ttyACM0").touch()
+    code, screen = ran("find-port", "--list", before=PORTS.format(folder=str(tmp_path)))
+    assert code == 0
+    assert "ttyACM0" in screen
+
+
 QUESTIONS = ("Calibrate again?", "Go on?", "Then press Enter", "(Enter ends it)")
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 
 import pytest
 from click.testing import CliRunner
@@ -49,6 +51,18 @@ def test_a_deleted_episode_comes_back_as_it_was(tmp_path, episode):
     assert (row["done"], row["path"]) == ("deleted", str(episode))
     assert "restored" in run("trash", tmp_path, "--restore", row["id"])
     assert files(tmp_path) == before, "nothing else is left"
+
+
+@pytest.mark.parametrize("change", [("delete", "--to-trash"), ("trim", "--in-place", "--from", "0.3")])
+def test_the_command_that_undoes_a_change_is_the_one_that_it_prints(tmp_path, episode, change):
+    folder = (tmp_path / "pick").rename(tmp_path / "my picks")
+    episode = folder / episode.relative_to(tmp_path / "pick")
+    before = {name: content for name, content in files(episode).items() if name.endswith(".mcap")}
+    command, *arguments = change
+    (undo,) = re.findall(r"^to undo: ibrobot episodes (.*)$", run(command, episode, *arguments), re.MULTILINE)
+    assert {name: files(tmp_path).get(str(episode.relative_to(tmp_path) / name)) for name in before} != before
+    assert "restored" in run(*shlex.split(undo))
+    assert {name: files(episode)[name] for name in before} == before
 
 
 def test_a_trim_in_place_keeps_the_original_until_the_trash_is_emptied(tmp_path, episode):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -70,7 +71,7 @@ class Trim:
         if self.output is None:
             made, trashed = trash.trim(episode, begin_s, end_s)
             if emit is None:
-                echo(f"to undo: ibrobot episodes trash {episode.parent} --restore {trashed.id}", err=True)
+                _say_undo(episode.parent, trashed.id)
         else:
             made = trash.copy_part(episode, self.output, begin_s, end_s)
         count = sum(topic.count for topic in made.topics.values())
@@ -100,7 +101,7 @@ class Delete:
             if self.to_trash:
                 trashed = trash.discard(episode)
                 if emit is None:
-                    echo(f"to undo: ibrobot episodes trash {episode.parent} --restore {trashed.id}", err=True)
+                    _say_undo(episode.parent, trashed.id)
                 _report(emit, Changed(str(episode), f"moved to {trash.TRASH}"))
                 continue
             if not (self.yes or confirm(f"delete {episode} ({size_text(size_of(episode))})?", flag="--yes")):
@@ -213,6 +214,10 @@ def _description(summary: EpisodeSummary) -> str:
 
     missing = sum(topic.missing for topic in summary.topics.values())
     return (f", {missing} are missing" if missing else "") + stated_outcome_text(summary)
+
+
+def _say_undo(folder: Path, number: str) -> None:
+    echo(f"to undo: ibrobot episodes trash {shlex.quote(str(folder))} --restore {number}", err=True)
 
 
 def _report(emit: Emit, change: Changed) -> None:
