@@ -14,7 +14,6 @@ from ibrobot_core.descriptors import (
     RecorderDescriptor as RecorderDescriptor,
     ReaderDescriptor as ReaderDescriptor,
     DecoderDescriptor as DecoderDescriptor,
-    DatasetDescriptor as DatasetDescriptor,
     ViewerDescriptor as ViewerDescriptor,
     Check as Check,
     Late as Late,
@@ -108,8 +107,6 @@ from ibrobot_core.interfaces import (
     Recorder as Recorder,
     EpisodeStart as EpisodeStart,
     EpisodeEnd as EpisodeEnd,
-    DatasetWriter as DatasetWriter,
-    DatasetSummary as DatasetSummary,
     Feature as Feature,
 )
 from ibrobot_core.interfaces.reader import (

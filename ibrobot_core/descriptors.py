@@ -83,7 +83,7 @@ class Descriptor[T]:
     """Name or path of the calibration in the options, for `load_calibration`; recordings contain that of hardware. None
     without a calibration."""
     tool: str | None = attrs.field(default=None, kw_only=True)
-    """The command that has `calibrate` and `import` for its calibrations, for messages, e.g. `ibrobot feetech`."""
+    """The command that has `calibrate` and `import` for its calibrations, for messages."""
     offers: Callable[[Any, str], bool] = _answer(False)
     """Whether other programs can call a service of the run, by its name, through a component with these options."""
     default: bool = attrs.field(default=False, kw_only=True)
@@ -240,14 +240,6 @@ class TransportDescriptor(Descriptor["interfaces.Transport"]):
 @attrs.frozen
 class RecorderDescriptor(Descriptor["interfaces.Recorder"]):
     """An episode recorder."""
-
-
-@attrs.frozen
-class DatasetDescriptor(Descriptor["interfaces.DatasetWriter"]):
-    """A dataset writer."""
-
-    flags: tuple[str, ...] = ()
-    """The options that are flags of the convert command, too."""
 
 
 @attrs.frozen

@@ -90,11 +90,6 @@ def ibrobot_features() -> Iterable[descriptors.FeatureDescriptor]:  # type: igno
 
 
 @hookspec
-def ibrobot_datasets() -> Iterable[descriptors.DatasetDescriptor]:  # type: ignore[empty-body]
-    """Dataset writers."""
-
-
-@hookspec
 def ibrobot_viewers() -> Iterable[descriptors.ViewerDescriptor]:  # type: ignore[empty-body]
     """Viewers."""
 

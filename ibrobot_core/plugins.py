@@ -46,7 +46,6 @@ KINDS: Mapping[str, str] = {
     "source": "ibrobot_sources",
     "transport": "ibrobot_transports",
     "recorder": "ibrobot_recorders",
-    "dataset": "ibrobot_datasets",
     "viewer": "ibrobot_viewers",
     "section": "ibrobot_sections",
 }

@@ -13,7 +13,7 @@ import attrs
 
 from ibrobot_core.config.contract_checks import completed
 from ibrobot_core.errors import ContractError
-from ibrobot_core.interfaces.dataset import Feature
+from ibrobot_core.interfaces.feature import Feature
 from ibrobot_core.messages import MESSAGE_TYPES, CompressedImage, Image, JointState
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.robot import Robot

@@ -1,9 +1,9 @@
 """The interfaces of plugins: one abstract class per kind."""
 
 from ibrobot_core.interfaces.context import Context, ModelContext
-from ibrobot_core.interfaces.dataset import DatasetSummary, DatasetWriter, Feature
 from ibrobot_core.interfaces.engine import Engine, EngineStats
 from ibrobot_core.interfaces.executor import Executor, GoalState, GoalStatus, Plan
+from ibrobot_core.interfaces.feature import Feature
 from ibrobot_core.interfaces.guard import Guard
 from ibrobot_core.interfaces.guide import Guide, Question
 from ibrobot_core.interfaces.hardware import (

@@ -15,7 +15,7 @@ from ibrobot_testing.contexts import ARM, GRIPPER
 from ibrobot_core.config import load_config
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.descriptors import HardwareDescriptor
-from ibrobot_core.interfaces.dataset import Feature
+from ibrobot_core.interfaces.feature import Feature
 from ibrobot_core.plugins import Entry, discover
 from ibrobot_core.schema import ActionSpec, Align, ImageSpec, ObservationSpec
 

@@ -34,7 +34,7 @@ def test_no_hook_is_documented_that_is_none() -> None:
 @pytest.mark.parametrize(
     "name",
     ["Hardware", "SimulatedHardware", "Sensor", "Teleop", "Policy", "Executor", "Transport",
-     "Recorder", "DatasetWriter", "Viewer"],
+     "Recorder", "Viewer"],
 )  # fmt: skip
 def test_every_method_is_listed_where_it_belongs(name: str) -> None:
     interface = getattr(interfaces, name, None) or getattr(api, name)

@@ -13,10 +13,11 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import attrs
+from ibrobot_provenance.datasets import DatasetDescriptor
 from ibrobot_provenance.jobs import check_pool
 from ibrobot_provenance.work_options import shard_of
 
-from ibrobot_core.api import Contract, DatasetDescriptor, DatasetError, option
+from ibrobot_core.api import Contract, DatasetError, option
 from ibrobot_core.app import (
     NORM_MODES,
     Emit,

@@ -16,6 +16,7 @@ from uuid import uuid4
 
 import attrs
 import numpy as np
+from ibrobot_provenance.datasets import DatasetWriter
 from ibrobot_provenance.ownership import Ownership
 from numpy.typing import NDArray
 
@@ -25,7 +26,6 @@ from ibrobot_core.api import (
     Contract,
     ContractError,
     DatasetError,
-    DatasetWriter,
     EpisodeAddress,
     EpisodeReader,
     EpisodeSummary,

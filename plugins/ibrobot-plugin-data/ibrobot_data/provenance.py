@@ -8,8 +8,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import attrs
+from ibrobot_provenance.datasets import DatasetSummary
 
-from ibrobot_core.api import Contract, DatasetSummary
+from ibrobot_core.api import Contract
 from ibrobot_data.episode import Unit
 from ibrobot_data.request import ConversionRequest
 

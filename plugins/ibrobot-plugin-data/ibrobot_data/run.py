@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_provenance.datasets import DatasetSummary
 from ibrobot_provenance.jobs import Job as PoolJob
 from ibrobot_provenance.jobs import Pool, open_pool
 from ibrobot_provenance.ownership import Ownership
 
-from ibrobot_core.api import Contract, DatasetError, DatasetSummary, EpisodeAddress, IbrobotError, seconds
+from ibrobot_core.api import Contract, DatasetError, EpisodeAddress, IbrobotError, seconds
 from ibrobot_core.app import DiskFull, installed_plugins, set_malloc
 from ibrobot_data.commanders import is_labelled
 from ibrobot_data.episode import (

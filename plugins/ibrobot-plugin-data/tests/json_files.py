@@ -11,12 +11,10 @@ from typing import Any, override
 
 import attrs
 import numpy as np
+from ibrobot_provenance.datasets import DatasetDescriptor, DatasetSummary, DatasetWriter
 
 from ibrobot_core.api import (
-    DatasetDescriptor,
     DatasetError,
-    DatasetSummary,
-    DatasetWriter,
     EpisodeAddress,
     EpisodeEnd,
     EpisodeReader,

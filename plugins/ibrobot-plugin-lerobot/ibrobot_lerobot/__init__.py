@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from ibrobot_core.api import Check, DatasetDescriptor, Late, PolicyDescriptor, ReaderDescriptor, hookimpl
+from ibrobot_provenance.datasets import DatasetDescriptor
+
+from ibrobot_core.api import Check, Late, PolicyDescriptor, ReaderDescriptor, hookimpl
 from ibrobot_core.app import Command
 from ibrobot_lerobot.contents import Contents
 from ibrobot_lerobot.options import LeRobotOptions, LeRobotPolicyOptions

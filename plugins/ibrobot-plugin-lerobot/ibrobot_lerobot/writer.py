@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any, override
 
 import numpy as np
+from ibrobot_provenance.datasets import DatasetSummary, DatasetWriter
 from numpy.typing import NDArray
 
-from ibrobot_core.api import DatasetError, DatasetSummary, DatasetWriter, Feature
+from ibrobot_core.api import DatasetError, Feature
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.episode import EpisodeWriter, Format
 from ibrobot_lerobot.merge import adopt, complete, merge

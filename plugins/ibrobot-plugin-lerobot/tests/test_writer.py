@@ -17,7 +17,7 @@ from ibrobot_lerobot import ibrobot_datasets
 from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_lerobot.video import choose_encoder
 from ibrobot_lerobot.writer import LeRobotDatasetWriter
-from ibrobot_testing import DatasetSuite
+from ibrobot_provenance.dataset_suite import DatasetSuite
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Context, DatasetError, Feature

@@ -1,4 +1,4 @@
-"""The hooks of the package: the kinds of pools and of reports."""
+"""The hooks of the package: the kinds of pools, of reports and of dataset writers."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from collections.abc import Iterable
 
 from ibrobot_core.api import hookimpl
 from ibrobot_core.app import Kind
+from ibrobot_provenance.datasets import DatasetDescriptor
 from ibrobot_provenance.jobs import PoolDescriptor
 from ibrobot_provenance.reports import ReportDescriptor
 
 
 @hookimpl
 def ibrobot_kinds() -> Iterable[Kind]:
-    """Pools, where jobs run, and reports on folders with results."""
+    """Pools, where jobs run, reports on folders with results, and dataset writers."""
     yield Kind("pool", "ibrobot_pools", PoolDescriptor)
+    yield Kind("dataset", "ibrobot_datasets", DatasetDescriptor)
     yield Kind("report", "ibrobot_reports", ReportDescriptor)

@@ -9,7 +9,6 @@ pytest.register_assert_rewrite(*(f"{__name__}.{module.name}" for module in pkgut
 
 from ibrobot_testing.command import ibrobot_command
 from ibrobot_testing.contexts import control_context, host_context, make_robot
-from ibrobot_testing.dataset import DatasetSuite
 from ibrobot_testing.descriptor import check_descriptor
 from ibrobot_testing.engine import EngineSuite
 from ibrobot_testing.executor import ExecutorSuite
@@ -26,7 +25,6 @@ from ibrobot_testing.transport import TransportSuite
 from ibrobot_testing.viewer import ViewerSuite
 
 __all__ = [
-    "DatasetSuite",
     "EngineSuite",
     "ExecutorSuite",
     "HardwareSuite",

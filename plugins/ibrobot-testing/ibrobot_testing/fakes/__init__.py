@@ -9,11 +9,10 @@ from ibrobot_testing.fakes.host import (
     FakeTeleop,
     FakeViewer,
 )
-from ibrobot_testing.fakes.storage import FakeDataset, FakeRecorder
+from ibrobot_testing.fakes.storage import FakeRecorder
 from ibrobot_testing.fakes.transport import FakeTransport
 
 __all__ = [
-    "FakeDataset",
     "FakeEngine",
     "FakeExecutor",
     "FakeHardware",

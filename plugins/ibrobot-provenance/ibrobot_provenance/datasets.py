@@ -5,23 +5,17 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import attrs
-import numpy as np
-from numpy.typing import NDArray
 
-from ibrobot_core.errors import NotSupported
+from ibrobot_core.api import Descriptor, NotSupported
 
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
-@attrs.frozen
-class Feature:
-    """A column of a dataset, with LeRobot's fields."""
-
-    dtype: str
-    """`float32`, `image`, …"""
-    shape: tuple[int, ...]
-    names: tuple[str, ...] = ()
+    from ibrobot_core.api import Feature
 
 
 @attrs.frozen
@@ -95,3 +89,11 @@ class DatasetWriter(ABC):
             NotSupported: by default.
         """
         raise NotSupported(f"{type(self).__name__} does not merge datasets")
+
+
+@attrs.frozen
+class DatasetDescriptor(Descriptor[DatasetWriter]):
+    """A dataset writer."""
+
+    flags: tuple[str, ...] = ()
+    """The options that are flags of the convert command, too."""

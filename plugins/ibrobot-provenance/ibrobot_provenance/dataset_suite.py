@@ -8,10 +8,11 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from ibrobot_testing.suite import Suite
 from numpy.typing import NDArray
 
-from ibrobot_core.api import DatasetError, DatasetWriter, Feature
-from ibrobot_testing.suite import Suite
+from ibrobot_core.api import DatasetError, Feature
+from ibrobot_provenance.datasets import DatasetWriter
 
 Values = Mapping[str, NDArray[np.generic]]
 
