@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import json
 import logging
+import math
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -30,7 +33,7 @@ from ibrobot_planning.world.objects import (
     WorldObject,
 )
 
-from ibrobot_core.api import Context, HardwareError, Pose, Robot, SteppedClock, Vector, Vector3
+from ibrobot_core.api import Clock, Context, HardwareError, Pose, RealClock, Robot, SteppedClock, Vector, Vector3
 from ibrobot_core.app import Bus
 from ibrobot_core.control.safety import SafetyLayer
 
@@ -45,9 +48,19 @@ MARGIN_M = 0.003
 class Loop:
     """The safety layer with the guard, in ticks; the joints follow exactly unless `measured` is given."""
 
-    def __init__(self, folder: Path, at: Vector | None = None, *, guarded: bool = True, **options: Any) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        at: Vector | None = None,
+        *,
+        guarded: bool = True,
+        clock: Clock | None = None,
+        **options: Any,
+    ) -> None:
         self.robot: Robot = make_robot(folder)
-        context = Context("guard", SteppedClock(7), logging.getLogger("test"), self.robot, self.robot.joint_names)
+        context = Context(
+            "guard", clock or SteppedClock(7), logging.getLogger("test"), self.robot, self.robot.joint_names
+        )
         self.guard = ClearanceGuard(
             ClearanceGuardOptions(**{"margin": MARGIN_M, "self_margin": MARGIN_M, **options}), context
         )
@@ -335,8 +348,174 @@ def test_a_world_that_the_arm_cannot_have_leaves_the_one_before(tmp_path, caplog
         loop.world({name: attrs.evolve(box(0, 0, 1, 0.1, 0.1, 0.1), link=link)})
         assert loop.go(ACROSS)[0] > 0
         loop.go(LEFT)
-    assert loop.guard.counts["refused_changes"] == 2
-    assert "the guard keeps the world that it had" in caplog.text
+    assert loop.guard.counts["refused_objects"] == 2
+    assert "the guard leaves an object out: stick: " in caplog.text
+
+
+def test_objects_beside_one_that_the_arm_cannot_have_are_known(tmp_path) -> None:
+    loop = Loop(tmp_path, LEFT)
+    loop.world({"hand": box(0, 0, 1, 0.1, 0.1, 0.1), **WALL, "stick": attrs.evolve(WALL["wall"], link="nowhere")})
+    assert loop.go(ACROSS)[0] > 0
+    assert loop.guard.counts["refused_objects"] == 2
+
+
+class Gate:
+    """Lets the guard build a world once it is open."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.opened = threading.Event()
+        self.worlds: list[World] = []
+        make = ClearanceGuard._made
+
+        def made(guard: ClearanceGuard, world: World) -> Any:
+            if threading.current_thread() is not threading.main_thread():
+                assert self.opened.wait(60)
+                self.worlds.append(world)
+            return make(guard, world)
+
+        monkeypatch.setattr(ClearanceGuard, "_made", made)
+
+
+class TestBuildingBesideTheLoop:
+    """In real time, a thread makes the pairs; the loop does not wait, and takes over what is finished."""
+
+    @pytest.fixture
+    def gate(self, monkeypatch) -> Gate:
+        return Gate(monkeypatch)
+
+    def settle(self, loop: Loop, gate: Gate) -> None:
+        """Wait until everything reported so far is finished."""
+        thread = loop.guard._building._thread
+        assert thread is not None
+        gate.opened.set()
+        thread.join()
+
+    def test_the_loop_goes_on_and_then_has_the_new_world(self, tmp_path, gate) -> None:
+        loop = Loop(tmp_path, LEFT, clock=RealClock())
+        loop.world(WALL)
+        assert loop.go(ACROSS) == pytest.approx(ACROSS), "the wall is not built yet, and nobody waits for it"
+        loop.go(LEFT)
+        self.settle(loop, gate)
+        assert loop.go(ACROSS)[0] > 0
+
+    def test_a_flood_of_changes_makes_one_world(self, tmp_path, gate) -> None:
+        loop = Loop(tmp_path, LEFT, clock=RealClock())
+        for number in range(300):
+            loop.world({f"object{number % 40}": box(1, 1, 1 + number / 100, 0.1, 0.1, 0.1)})
+        loop.world(WALL)
+        self.settle(loop, gate)
+        assert len(gate.worlds) <= 3
+        assert loop.go(ACROSS)[0] > 0
+        assert loop.guard.counts["world_changes"] == 301
+
+    def test_a_world_that_cannot_be_built_is_one_that_is_not_known(self, tmp_path, monkeypatch, caplog) -> None:
+        loop = Loop(tmp_path, LEFT)
+        make = loop.guard._building._make
+        failing = True
+
+        def made(world: World) -> Any:
+            if failing:
+                raise MemoryError("no room")
+            return make(world)
+
+        monkeypatch.setattr(loop.guard._building, "_make", made)
+        loop.world(WALL)
+        assert loop.go(ACROSS)[0] == pytest.approx(LEFT[0])
+        assert json.loads(loop.guard.overruled)["second"] == "the guard cannot take it in: MemoryError: no room"
+        failing = False
+        loop.world({})
+        assert 0 < loop.go(ACROSS)[0] < LEFT[0] - 0.3, "it was not lost"
+
+
+def nonsense() -> Iterator[Any]:
+    """Values that somebody may send in place of the right ones."""
+    yield from (
+        None,
+        True,
+        -1,
+        0,
+        10**400,
+        1e308,
+        math.nan,
+        math.inf,
+        "",
+        "x",
+        "\x00",
+        [],
+        [[]],
+        {},
+        {"a": 1},
+        b"x",
+        [None] * 8,
+    )
+
+
+def spoiled() -> Iterator[tuple[str, Any]]:
+    """A right message with one value, at each place in it, replaced, left out, or doubled."""
+    cloud = ["voxels", 0.1, "AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"]
+    things = {
+        name: {"shape": shape, "pose": [1, 1, 1, 0, 0, 0, 1], "link": None, "may_touch": links}
+        for name, shape, links in (("it", ["box", [0.1, 0.1, 0.1]], ["hand"]), ("cloud", cloud, []))
+    }
+    right = {"changed": things, "removed": ["gone"], "stale": ""}
+
+    def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+        yield path
+        inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+        for key, each in inner:
+            yield from places(each, (*path, key))
+
+    for path in places(right):
+        for number, wrong in enumerate([*nonsense(), KeyError]):
+            message = copy.deepcopy(right)
+            if not path:
+                yield f"all {number}", wrong if wrong is not KeyError else {}
+                continue
+            holder: Any = message
+            for key in path[:-1]:
+                holder = holder[key]
+            if wrong is KeyError:
+                del holder[path[-1]]
+            else:
+                holder[path[-1]] = wrong
+            yield f"{'.'.join(map(str, path))} {number}", message
+
+
+def test_messages_of_every_kind_neither_break_the_loop_nor_lose_the_wall(tmp_path) -> None:
+    """Each is refused with a reason, or taken; the wall stands before and after, also while the arm moves at it."""
+    loop = Loop(tmp_path, LEFT)
+    loop.world(WALL)
+    seen, refused, tried, nearest = Seen(WALL), 0, 0, 1.0
+    for _, message in spoiled():
+        tried += 1
+        try:
+            loop.guard.world(message)
+        except HardwareError:
+            refused += 1
+        before = loop.position
+        nearest = min(nearest, seen.along(before, loop.tick(ACROSS)))
+        assert np.isfinite(loop.position).all()
+        loop.guard.world({"changed": {}, "removed": ["it", "cloud"], "stale": ""})
+    assert (tried, refused > 400) == (684, True)
+    assert nearest > MARGIN_M - 0.001
+    assert loop.go(ACROSS)[0] > 0
+
+
+@pytest.mark.parametrize("at", range(0, 60, 4))
+@pytest.mark.parametrize("deleted", [("wall",), ("post", "wall"), ("post", "wall", "nothing")])
+def test_a_world_that_is_deleted_in_motion_and_comes_back(tmp_path, at: int, deleted: tuple[str, ...]) -> None:
+    """While it is gone the way is free; what comes back is avoided from where braking leads."""
+    loop, seen = Loop(tmp_path, LEFT), Seen(WALL)
+    loop.world(WALL | {"post": POSTS["post"]})
+    loop.go(ACROSS, at)
+    loop.world({}, *deleted)
+    loop.go(ACROSS, 8)
+    room = seen.along(loop.position, loop.safety.rest, 20)
+    loop.world(WALL)
+    nearest, before = 1.0, loop.position
+    for _ in range(60):
+        nearest, before = min(nearest, seen.along(before, loop.tick(ACROSS))), loop.position
+    assert nearest > min(room, MARGIN_M) - 0.001
 
 
 def test_an_object_that_moves_is_where_it_is_and_not_where_it_was(tmp_path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from base64 import b64decode, b64encode
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Self
 
 import attrs
@@ -13,6 +13,8 @@ from ibrobot_core.api import HardwareError, Pose, Quaternion, Vector3
 from ibrobot_planning.world.objects import SIMPLE, Mesh, Shape, Voxels, World, WorldObject
 
 _NAMES: Mapping[type[Any], str] = {kind: name for name, kind in SIMPLE.items()}
+_FARTHEST_M = 1000.0
+"""Positions farther away are mistakes, and the distances to them are not computed well."""
 
 
 @attrs.frozen(eq=False)
@@ -37,6 +39,13 @@ class WorldChange:
             return world
         kept = {name: thing for name, thing in world.objects.items() if name not in self.removed}
         return World({**kept, **self.changed})
+
+    def parts(self, size: int) -> Iterator[Self]:
+        """The same as several changes of at most so many objects each."""
+        items = list(self.changed.items())
+        yield attrs.evolve(self, changed=dict(items[:size]))
+        for begin in range(size, len(items), size):
+            yield attrs.evolve(self, changed=dict(items[begin : begin + size]), removed=())
 
     def only_moved(self, world: World) -> tuple[str, ...] | None:
         """The standing objects that are only elsewhere than in `world`; None if anything else has changed."""
@@ -65,7 +74,7 @@ class WorldChange:
             changed = {str(name): _read(thing) for name, thing in message.get("changed", {}).items()}
             removed = tuple(map(str, message.get("removed", ())))
             return cls(changed, removed, str(message.get("stale", "")))
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
             raise HardwareError(f"the guard cannot read a change of the world: {error}") from None
 
 
@@ -79,6 +88,8 @@ def _written(thing: WorldObject) -> dict[str, Any]:
 
 def _read(thing: Mapping[str, Any]) -> WorldObject:
     x, y, z, qx, qy, qz, qw = map(float, thing["pose"])
+    if max(abs(x), abs(y), abs(z)) > _FARTHEST_M:
+        raise ValueError(f"a position of {x:g}, {y:g}, {z:g} m")
     link = thing["link"]
     return WorldObject(
         _read_shape(thing["shape"]),

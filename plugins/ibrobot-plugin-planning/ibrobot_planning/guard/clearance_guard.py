@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping
 from typing import Any, override
 
@@ -11,13 +10,14 @@ import numpy as np
 import pinocchio
 from ibrobot_kinematics.poses import matrix
 
-from ibrobot_core.api import Context, PlanningError, Pose, Vector, Vector3, seconds
+from ibrobot_core.api import Context, Pose, SteppedClock, Vector, Vector3, seconds
 from ibrobot_core.app import Guard
+from ibrobot_planning.guard.building import Building, Finished
 from ibrobot_planning.guard.changes import WorldChange
 from ibrobot_planning.guard.options import ClearanceGuardOptions
 from ibrobot_planning.guard.pairs import Indices, Pairs
 from ibrobot_planning.guard_label import label
-from ibrobot_planning.world.arm import Arm, Pair, sorted_pair
+from ibrobot_planning.world.arm import Arm, sorted_pair
 from ibrobot_planning.world.checked_arm import may_touch_arm
 from ibrobot_planning.world.objects import FLOOR, Plane, World, WorldObject
 
@@ -47,7 +47,7 @@ class ClearanceGuard(Guard):
     """
 
     def __init__(self, options: ClearanceGuardOptions, context: Context) -> None:
-        self._options, self._log = options, context.log
+        self._options = options
         self._arm: Arm = may_touch_arm(context.robot, context.log)
         period_s = seconds(context.period_ns)
         self._period_s = period_s
@@ -58,9 +58,11 @@ class ClearanceGuard(Guard):
         self._pressed = {
             sorted_pair(name, other): options.press for name, others in options.may_touch.items() for other in others
         }
-        self._world = World()
-        self._changes: deque[WorldChange] = deque()
-        self._pairs = self._made()
+        self._begin: Vector = np.zeros(len(self._arm.joint_names))
+        """The last command [rad], shape (J,)."""
+        self._pairs = self._made(World())
+        in_thread = not isinstance(context.clock, SteppedClock)
+        self._building = Building(self._arm, self._made, context.log, in_thread=in_thread)
         self._stale = self._label = ""
         self._pair: tuple[str, ...] = ()
         """What the last setpoint was about to touch."""
@@ -72,21 +74,24 @@ class ClearanceGuard(Guard):
         """Largest distance of each joint from the path of its commands, fading [rad], shape (J,)."""
         self._fade = float(np.exp(-period_s / _DECAY_S))
         self._reach = self._pairs.levers.max(axis=0, initial=0.0)
-        self._counts = {"ticks": 0, "slid": 0, "braked": 0, "stale": 0, "world_changes": 0, "refused_changes": 0}
+        self._counts = {"ticks": 0, "slid": 0, "braked": 0, "stale": 0}
 
     @override
     def world(self, change: Mapping[str, Any]) -> None:
-        self._changes.append(WorldChange.read(change))
+        self._building.add(WorldChange.read(change))
 
     @property
     def counts(self) -> Mapping[str, int]:  # type: ignore[override]
         """Ticks with a changed setpoint (`ticks`), those in which the arm slid or braked, and what the world did."""
-        return self._counts | {"distances": self._pairs.measured, "pairs": len(self._pairs.names)}
+        building, pairs = self._building, self._pairs
+        of_world = {"world_changes": building.changes, "refused_objects": building.refused}
+        return self._counts | of_world | {"distances": pairs.measured, "pairs": len(pairs.names)}
 
     @override
     def accept(self, position: Vector, velocity: Vector, setpoint: Vector, measured: Vector) -> Vector:
-        while self._changes:
-            self._apply(self._changes.popleft())
+        while self._building.finished:
+            self._take(self._building.finished.popleft())
+        self._begin = position
         self._note(position, measured)
         self._pairs.left = _MOST_LOOKS
         step = velocity * self._period_s
@@ -186,32 +191,15 @@ class ClearanceGuard(Guard):
         nearest = gaps[int((gaps @ self._reach).argmin())]
         self._away = np.maximum(self._away, np.where(self._follows, nearest, 0.0))
 
-    def _apply(self, change: WorldChange) -> None:
-        """Bring the world up to date; one that no arm can have changes nothing."""
-        self._counts["world_changes"] += 1
-        self._stale = change.stale
-        world = change.apply(self._world)
-        if world is self._world:
-            return
-        moved = change.only_moved(self._world)
-        try:
-            if moved is None:
-                self._world, before = world, self._world
-                try:
-                    made = self._made()
-                except BaseException:
-                    self._world = before
-                    raise
-                made.keep_limits(self._pairs)
-                made.measured = self._pairs.measured
-                self._pairs = made
-            else:
-                self._world = world
-                for name in moved:
-                    self._pairs.move(self._whole(world), name, pinocchio.SE3(matrix(world.objects[name].pose)))
-        except PlanningError as error:
-            self._counts["refused_changes"] += 1
-            self._log.warning("the guard keeps the world that it had: %s", error)
+    def _take(self, finished: Finished) -> None:
+        """Have a world that is finished."""
+        self._stale = finished.stale
+        if finished.pairs is not None:
+            finished.pairs.keep_limits(self._pairs)
+            finished.pairs.measured = self._pairs.measured
+            self._pairs = finished.pairs
+        for name, pose in finished.moved:
+            self._pairs.move(name, pinocchio.SE3(matrix(pose)))
 
     def _whole(self, world: World) -> World:
         """A world with the table, and with what the options permit."""
@@ -220,8 +208,11 @@ class ClearanceGuard(Guard):
             objects[name] = attrs.evolve(objects[name], may_touch=objects[name].may_touch.union(free[name]))
         return World(objects)
 
-    def _made(self) -> Pairs:
-        options = self._options
-        world = self._whole(self._world)
-        pressed: Mapping[Pair, float] = self._pressed
-        return Pairs(self._arm, world, margin=options.margin, self_margin=options.self_margin, pressed=pressed)
+    def _made(self, world: World) -> Pairs:
+        """The pairs of a world; also called in another thread."""
+        options, pressed = self._options, self._pressed
+        made = Pairs(
+            self._arm, self._whole(world), margin=options.margin, self_margin=options.self_margin, pressed=pressed
+        )
+        made.estimate(self._begin)
+        return made

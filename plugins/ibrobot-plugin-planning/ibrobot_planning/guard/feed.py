@@ -8,6 +8,9 @@ from ibrobot_core.app import CONTROL, RunView, SessionWorker
 from ibrobot_planning.guard.changes import WorldChange
 from ibrobot_planning.world.objects import World, observed_world
 
+_MOST = 16
+"""Objects of one message: control reads it within a tick."""
+
 
 class GuardFeed(SessionWorker):
     """Compares the world with what the guard knows at each state of control, and sends what has changed."""
@@ -33,5 +36,6 @@ class GuardFeed(SessionWorker):
         stale = "" if observed.is_awaited else observed.refusal
         if observed.world == self._sent and stale == self._stale:
             return
-        self.session.change_world(WorldChange.between(self._sent, observed.world, stale).message())
+        for part in WorldChange.between(self._sent, observed.world, stale).parts(_MOST):
+            self.session.change_world(part.message())
         self._sent, self._stale = observed.world, stale

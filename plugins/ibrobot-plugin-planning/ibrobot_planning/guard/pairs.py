@@ -44,7 +44,6 @@ class Pairs:
     def __init__(
         self, arm: Arm, world: World, *, margin: float, self_margin: float, pressed: Mapping[Pair, float]
     ) -> None:
-        self.world = world
         self._checks = Collisions(arm, world, arm.joint_names, padding=margin, self_padding=self_margin)
         self._geometry, self._results = self._checks.geometry, self._checks.results
         self.names: Sequence[Pair] = self._checks.pairs
@@ -68,17 +67,30 @@ class Pairs:
         """Whether each joint moves the first and the second shape of each pair, not the other, shape (P, 2, J)."""
         self.levers: Vector = np.where(both, 0.0, a + b)
         """Largest motion of each pair per joint [m/rad], shape (P, J)."""
-        self._centres = [shape.geometry.aabb_center if shape.parentJoint else np.zeros(3) for shape in shapes]
-        """Of bounding spheres, each in the frame of its shape [m]; of no use for those that stand."""
-        radii = np.array([shape.geometry.aabb_radius if shape.parentJoint else 0.0 for shape in shapes])
+        self._centres = [shape.geometry.aabb_center if _has_sphere(shape) else np.zeros(3) for shape in shapes]
+        """Of bounding spheres, each in the frame of its shape [m]."""
+        self._spheres = np.array([shape.geometry.aabb_radius if _has_sphere(shape) else np.inf for shape in shapes])
+        """Their radii [m]."""
+        radii = np.array(
+            [radius if shape.parentJoint else 0.0 for radius, shape in zip(self._spheres, shapes, strict=True)]
+        )
         self._radii = np.stack([radii[self._first], radii[self._second]], axis=1)
+        """Of the shapes of each pair that move, shape (P, 2) [m]."""
         convex = np.array([isinstance(shape.geometry, _CONVEX) for shape in shapes])
         self._convex = convex[self._first] & convex[self._second]
-        self._objects = {name: np.flatnonzero([name in pair for pair in self.names]) for name in world.objects}
+        numbers: dict[str, list[int]] = {name: [] for name in world.objects}
+        for number, pair in enumerate(self.names):
+            for name in pair:
+                if name in numbers:
+                    numbers[name].append(number)
+        self._objects = {name: np.array(each, dtype=np.intp) for name, each in numbers.items()}
+        """Object -> its pairs."""
         self._known = np.full(len(self.names), -math.inf)
         """The last distance of each pair [m], shape (P,)."""
         self._at = np.zeros_like(self.levers)
         """The configuration of each [rad], shape (P, J)."""
+        self._q: Vector = np.zeros(self.levers.shape[1])
+        """The configuration at which the shapes are [rad], shape (J,)."""
         self.measured = 0
         """Number of distances measured so far."""
         self.left = 0
@@ -94,21 +106,23 @@ class Pairs:
         for number, name in enumerate(self.names) if before else ():
             self.limits[number] = min(self.limits[number], before.get(name, math.inf))
 
-    def move(self, world: World, name: str, placement: Any) -> None:
-        """Move an object that stands in the base frame to `placement`, a pinocchio.SE3, as it is in `world`."""
-        self.world = world
-        pairs = self._objects[name]
-        for shape in self._geometry.geometryObjects:
-            if shape.name == self._shape_names[name]:
-                shape.placement = placement
-        self._known[pairs] = -math.inf
+    def move(self, name: str, placement: Any) -> None:
+        """Move an object that stands in the base frame to `placement`, a pinocchio.SE3."""
+        pairs, shape = self._objects[name], self._geometry.ngeoms - len(self._objects) + list(self._objects).index(name)
+        self._geometry.geometryObjects[shape].placement = placement
         self.limits[pairs] = self.margins[pairs]
+        self.estimate(self._q, pairs)
 
-    @property
-    def _shape_names(self) -> Mapping[str, str]:
-        """Object -> the name of its shape; those of objects come last."""
-        first = self._geometry.ngeoms - len(self.world.objects)
-        return {name: f"{first + number}" for number, name in enumerate(self.world.objects)}
+    def estimate(self, q: Vector, pairs: Indices | None = None) -> None:
+        """Take as distances of pairs, by default of all, those of their bounding spheres at `q`, shape (J,)."""
+        pairs = np.arange(len(self.names)) if pairs is None else pairs
+        self._place(q)
+        first, second, placed = self._first[pairs], self._second[pairs], self._results.oMg
+        centres = np.zeros((len(self._centres), 3))
+        for number in np.union1d(first, second).tolist():
+            centres[number] = placed[number].act(self._centres[number])
+        apart = np.linalg.norm(centres[first] - centres[second], axis=1)
+        self._known[pairs], self._at[pairs] = apart - self._spheres[first] - self._spheres[second], q
 
     def unproved(self, begin: Vector, end: Vector, extra: Vector, among: Indices | slice = slice(None)) -> Indices:
         """Which pairs of `among` may come nearer than allowed somewhere between two configurations, each of shape (J,).
@@ -126,16 +140,19 @@ class Pairs:
 
     def distances(self, q: Vector, pairs: Indices) -> Vector:
         """Measure the distances of pairs at a configuration, shape (J,) [m]."""
-        checks = self._checks
-        pinocchio.updateGeometryPlacements(
-            checks.arm.model, checks.data, self._geometry, self._results, checks.native(q[None])[0]
-        )
+        self._place(q)
         compute, geometry, results = pinocchio.computeDistance, self._geometry, self._results
         values = np.array([compute(geometry, results, pair).min_distance for pair in pairs.tolist()])
         self.measured += len(pairs)
         self.left -= 1
         self._known[pairs], self._at[pairs] = values, q
         return values
+
+    def _place(self, q: Vector) -> None:
+        """Have all shapes where they are at a configuration, shape (J,)."""
+        checks, self._q = self._checks, q
+        native = checks.native(q[None])[0]
+        pinocchio.updateGeometryPlacements(checks.arm.model, checks.data, self._geometry, self._results, native)
 
     def required(self, q: Vector, pairs: Indices, extra: Vector) -> Vector:
         """How far pairs must stay apart from now on, if the arm is at `q` [m].
@@ -243,6 +260,12 @@ def _between(path: Vector, at: float) -> Vector:
     share = at - before
     configuration: Vector = path[before] * (1.0 - share) + path[before + 1] * share
     return configuration
+
+
+def _has_sphere(shape: Any) -> bool:
+    """Whether a bounding sphere of a shape is known; it computes it."""
+    shape.geometry.computeLocalAABB()
+    return math.isfinite(shape.geometry.aabb_radius)
 
 
 def _levers(arm: Arm, shapes: Sequence[Any]) -> Vector:

@@ -5,6 +5,7 @@ A plan uses one `World`; changes make a new one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -178,7 +179,7 @@ class WorldObject:
         p, o = self.pose.position, self.pose.orientation
         if not np.isfinite([p.x, p.y, p.z, o.x, o.y, o.z, o.w]).all():
             raise ValueError("the pose must be finite")
-        length = float(np.linalg.norm([o.x, o.y, o.z, o.w]))
+        length = math.hypot(o.x, o.y, o.z, o.w)
         if abs(length - 1) > 1e-3:
             raise ValueError(f"the orientation is a quaternion of length {length:.3g}, must be 1")
 

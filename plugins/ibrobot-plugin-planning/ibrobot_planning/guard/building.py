@@ -1,0 +1,117 @@
+"""Makes the pairs of a changed world beside the control loop, which takes them over when they are finished."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable
+
+import attrs
+
+from ibrobot_core.api import PlanningError, Pose
+from ibrobot_planning.guard.changes import WorldChange
+from ibrobot_planning.guard.pairs import Pairs
+from ibrobot_planning.world.arm import Arm
+from ibrobot_planning.world.coal_shapes import geometry
+from ibrobot_planning.world.objects import World
+
+_SWITCH_S = 0.0005
+"""How long the thread may keep the loop of the same process waiting [s]; 5 ms is Python's default."""
+
+
+@attrs.frozen(eq=False)
+class Finished:
+    """A world that the loop is to take over."""
+
+    stale: str
+    """Why it is not known well enough; empty if it is."""
+    pairs: Pairs | None = None
+    """Those of the new world; None if objects are only elsewhere."""
+    moved: tuple[tuple[str, Pose], ...] = ()
+    """These, and where they are."""
+
+
+class Building:
+    """Takes changes of the world in, in order, and puts what is finished into `finished`.
+
+    Objects that the arm cannot have, e.g. on a link that is not there, are left out, each with a warning.
+
+    Args:
+        arm: the arm.
+        make: makes the pairs of a world.
+        log: for objects that are left out.
+        in_thread: whether to build in a thread; else in `add`, as stepped time needs it.
+    """
+
+    def __init__(self, arm: Arm, make: Callable[[World], Pairs], log: logging.Logger, *, in_thread: bool) -> None:
+        self._arm, self._make, self._log = arm, make, log
+        self._world = self._made = World()
+        """As it was reported, and that of the last pairs."""
+        self._changes: queue.SimpleQueue[WorldChange] = queue.SimpleQueue()
+        self._in_thread = in_thread
+        self._thread: threading.Thread | None = None
+        """Runs while there are changes."""
+        self._lock = threading.Lock()
+        """Held for the start and the end of the thread, never while it builds."""
+        self.finished: deque[Finished] = deque()
+        self.changes = self.refused = 0
+        """Number of changes, and of objects that were left out."""
+
+    def add(self, change: WorldChange) -> None:
+        """Have a change taken in."""
+        self._changes.put(change)
+        if not self._in_thread:
+            self._build([self._changes.get()])
+            return
+        with self._lock:
+            if self._thread is None:
+                sys.setswitchinterval(min(_SWITCH_S, sys.getswitchinterval()))
+                self._thread = threading.Thread(target=self._run, name="guard", daemon=True)
+                self._thread.start()
+
+    def _run(self) -> None:
+        while True:
+            with self._lock:
+                if self._changes.empty():
+                    self._thread = None
+                    return
+            changes = []
+            while not self._changes.empty():  # a flood makes one world
+                changes.append(self._changes.get())
+            self._build(changes)
+
+    def _build(self, changes: list[WorldChange]) -> None:
+        before, world = self._made, self._world
+        for change in changes:
+            usable = {name: thing for name, thing in change.changed.items() if self._is_usable(name, change)}
+            world = attrs.evolve(change, changed=usable).apply(world)
+        self._world = world
+        self.changes += len(changes)
+        stale = changes[-1].stale
+        difference = WorldChange.between(before, world)
+        moved = difference.only_moved(before)
+        try:
+            if moved is None:
+                self.finished.append(Finished(stale, self._make(world)))
+            else:
+                places = tuple((name, world.objects[name].pose) for name in moved)
+                self.finished.append(Finished(stale, None, places))
+        except Exception as error:  # noqa: BLE001 - whatever it is, the loop must know that the world is another one
+            self._log.exception("the guard cannot take in the world")
+            self.finished.append(Finished(f"the guard cannot take it in: {type(error).__name__}: {error}"))
+        else:
+            self._made = world
+
+    def _is_usable(self, name: str, change: WorldChange) -> bool:
+        thing = change.changed[name]
+        try:
+            World({name: thing}).check(self._arm.frames)
+            geometry(thing.shape)
+        except (PlanningError, ValueError, RuntimeError) as error:
+            self.refused += 1
+            self._log.warning("the guard leaves an object out: %s: %s", name, error)
+            return False
+        return True
