@@ -38,7 +38,7 @@ CAMERAS = ("top", "wrist")
 SIZE = (72, 96)
 HOME = np.array([0.0, -0.8, 0.9, 0.2])
 REACH = np.array([0.7, 0.3, -0.4, 0.9])
-COMMANDS, STATES, COMMANDER = "/arm/commands", "/joint_states", "/commander"
+COMMANDS, STATES, COMMANDER, GUARD = "/arm/commands", "/joint_states", "/commander", "/guard"
 
 
 def contract(cameras: Collection[str] = CAMERAS) -> Contract:
@@ -92,6 +92,8 @@ class Run:
     """Time before the policy moves."""
     speed: float = 1.0
     noise: float = 0.004
+    guarded: tuple[float, float] = (0.0, 0.0)
+    """Shares of the run from which and until which the guard holds the arm back."""
     takeover: tuple[float, float] = (0.0, 0.0)
     """From when to when an operator commands, as shares of the run."""
     cameras: tuple[str, ...] = CAMERAS
@@ -176,6 +178,7 @@ def metadata(run: Run) -> dict[str, str]:
     limits = {"lower": -3.0, "upper": 3.0, "max_velocity": run.velocity, "max_acceleration": 40.0}
     document = {
         "robot": {"name": "made", "joints": [{"name": joint, **limits} for joint in JOINTS]},
+        "control": {"guard": {"type": "clearance"}} if run.guarded[1] else {},
         "control_modes": {
             "learned": {"inference": {"model": "act"}, "dispatch": {"watermark": run.watermark}},
             "teleop": {"teleop": "leader"},
@@ -207,6 +210,7 @@ class _Maker:
         self._plan, self._counts, self._begin = np.empty((0, len(JOINTS))), np.empty(0), 0
         self._command = intended(run, np.zeros(1), self._phase)[0]
         self._state = self._command.copy()
+        self._held = False
         self._waiting, self._side, self._next_ask, self._paused_until = False, 1.0, 0.0, 0.0
 
     def messages(self) -> Iterator[Recorded]:
@@ -257,10 +261,14 @@ class _Maker:
     def _control(self, tick: int, t_s: float) -> Iterator[tuple[str, Message]]:
         run = self.run
         operated = run.takeover[0] * run.seconds <= t_s < run.takeover[1] * run.seconds
+        held = run.guarded[0] * run.seconds <= t_s < run.guarded[1] * run.seconds
+        if held != self._held:
+            yield GUARD, String('{"first": "gripper", "second": "bin", "distance": 0.0031}' if held else "")
+        self._held = held
         if run.pause[0] and t_s >= self._paused_until and tick and tick % int(run.pause[0] * CONTROL_HZ) == 0:
             self._paused_until = t_s + run.pause[1]
         if t_s >= self._paused_until:
-            most = run.velocity / CONTROL_HZ
+            most = 0.0 if self._held else run.velocity / CONTROL_HZ
             self._command = self._command + np.clip(self._wanted(t_s, operated) - self._command, -most, most)
             yield COMMANDS, Float64MultiArray(self._command.copy())
         target = self._command.copy()

@@ -22,6 +22,7 @@ TIMES: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = {
     "requests_fail": ({"failing": 0.25}, {"failing": 0.4}, {"failing": 0.7}),
     "ticks_missed": ({"pause": (1.0, 0.1)}, {"pause": (1.0, 0.2)}, {"pause": (1.0, 0.5)}),
     "limits_low": ({"velocity": 0.5}, {"velocity": 0.4}, {"velocity": 0.2}),
+    "guard_held": ({"guarded": (0.4, 0.6)}, {"guarded": (0.3, 0.7)}, {"guarded": (0.1, 0.9)}),
     "takeover": ({"takeover": (0.2, 0.5)}, {"takeover": (0.2, 0.6)}, {"takeover": (0.1, 0.9)}),
     "arm_not_following": ({"gain": {0: 0.7}}, {"gain": {0: 0.5}}, {"gain": {0: 0.0}}),
     "smoothing_averages": ({"torn": 0.15}, {"torn": 0.3}, {"torn": 0.6}),

@@ -85,7 +85,7 @@ class Cause(ABC):
     """The condition in which nothing is wrong, for the list of what is healthy, e.g. `cameras stand as in training`."""
     needs: ClassVar[frozenset[str]] = frozenset()
     """The streams of the window and the reference that it needs: `state`, `commands`, `answers`, `chunks` (used ones),
-    `pictures`, `outcome`, `demonstration`; `card`, `card pictures`, `training card`; `model`."""
+    `pictures`, `guard`, `outcome`, `demonstration`; `card`, `card pictures`, `training card`; `model`."""
     explains: ClassVar[frozenset[str]] = frozenset()
     """Names of causes that this one brings about: those are consequences if this one is found."""
     remedy: ClassVar[str]
@@ -166,7 +166,7 @@ class Diagnosis:
 _LACKS = {
     "state": "no joint positions were recorded", "commands": "no commands were recorded",
     "answers": "no answers of a model were recorded", "chunks": "no answer of the model was used",
-    "pictures": "no pictures were recorded", "outcome": "nobody judged the outcome",
+    "pictures": "no pictures were recorded", "guard": "the robot had no guard", "outcome": "nobody judged the outcome",
     "card": "there is no card of the model's data: --data",
     "card pictures": "there is no card of the model's pictures: --data",
     "training card": "there is no card from a training", "model": "the model was not asked: --model",

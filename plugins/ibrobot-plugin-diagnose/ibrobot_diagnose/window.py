@@ -31,6 +31,7 @@ type Floats = NDArray[np.float64]
 type Times = NDArray[np.int64]
 
 COMMANDER = "/commander"
+GUARD = "/guard"
 OPERATOR = "operator"
 COMPARED = 60
 """Pictures of each camera that are compared with the data."""
@@ -165,6 +166,8 @@ class Window:
     """Key of an observation -> its camera."""
     commanders: tuple[tuple[int, str], ...] = ()
     """Time from which [ns] the commander changes, and who: policy, operator or handover."""
+    guarded: tuple[tuple[int, str], ...] = ()
+    """Time from which [ns] the guard says something else, and what: JSON of a pair, or nothing."""
     metadata: Mapping[str, str] = attrs.field(factory=dict)
     outcome: str = "unknown"
     sampled: bool = False
@@ -191,6 +194,7 @@ class Window:
             "state": len(self.state.times_ns) > 1, "commands": len(self.command.times_ns) > 1,
             "answers": bool(self.asked), "chunks": any(each.used for each in self.asked),
             "pictures": any(each.pictures for each in self.cameras.values()),
+            "guard": bool((self.document.get("control") or {}).get("guard")),
             "outcome": self.outcome in ("success", "failure"), "demonstration": not self.asked,
         }  # fmt: skip
         return frozenset(name for name, there in has.items() if there)
@@ -297,6 +301,7 @@ class _Reading:
         self._commanded = dict.fromkeys(self._joints, float("nan"))
         self._asked: list[Asked] = []
         self._commanders: list[tuple[int, str]] = []
+        self._guarded: list[tuple[int, str]] = []
         self._keep_every_ns = 1
 
     def window(self, name: str) -> Window:
@@ -304,7 +309,7 @@ class _Reading:
         summary, contract = self._reader.summary(), self._contract
         self._keep_every_ns = max(1, (summary.end_ns - summary.start_ns) // KEPT)
         state_topics = {part.topic for part in contract.observation_parts if part.type == JointState.ros_type}
-        wanted = {*state_topics, *self._pictures, *self._command_topics, MODEL_ANSWERS, COMMANDER}
+        wanted = {*state_topics, *self._pictures, *self._command_topics, MODEL_ANSWERS, COMMANDER, GUARD}
         there = {topic for topic, each in summary.topics.items() if each.count}
         for item in self._reader.messages(wanted & there):
             message, t_ns = item.message, item.received_ns
@@ -319,6 +324,8 @@ class _Reading:
                     self._take_picture(self._pictures[item.topic], message, t_ns)
             elif isinstance(message, JointState):
                 self._take_state(message, t_ns)
+            elif isinstance(message, String) and item.topic == GUARD:
+                self._guarded.append((t_ns, message.data))
             elif isinstance(message, String) and [who for _, who in self._commanders[-1:]] != [message.data]:
                 self._commanders.append((t_ns, message.data))
         step_ns = contract.step_ns
@@ -327,8 +334,8 @@ class _Reading:
         return Window(
             name, contract, ticks, self._joints, Track.of(self._joints, self._states),
             Track.of(self._joints, self._commands), tuple(self._asked),
-            {each.key: each for each in self._pictures.values()}, tuple(self._commanders), summary.metadata,
-            summary.outcome, self._reader.sampled,
+            {each.key: each for each in self._pictures.values()}, tuple(self._commanders), tuple(self._guarded),
+            summary.metadata, summary.outcome, self._reader.sampled,
         )  # fmt: skip
 
     def _take_state(self, message: JointState, t_ns: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
+import attrs
 import pytest
 from ibrobot_diagnose.card import make_card
 from ibrobot_diagnose.cause import KIND, Cause, CauseDescriptor, Evidence, Reference, diagnose, installed_causes
@@ -55,6 +56,15 @@ def test_planted_fault_is_named_first_with_the_data(cause, data):
 def test_healthy_runs_accuse_nobody():
     runs = [Run(seed=seed, cameras=(), latency_s=0.02 + 0.003 * (seed % 50)) for seed in range(9100, 9125)]
     assert Counter(first_of(run, Reference()) for run in runs) == {"": 25}
+
+
+@pytest.mark.parametrize("label", ["no JSON", "[]", "{}", "3", '{"first": 1}'])
+def test_a_label_of_another_guard_is_shown_as_it_is(label):
+    window = window_of(Run(seed=9200, cameras=(), guarded=(0.2, 0.8)))
+    said = ((window.start_ns, label), (int(window.ticks_ns[-1]), ""))
+    (first, *_) = diagnose(attrs.evolve(window, guarded=said), Reference()).findings
+    assert first.name == "guard_held"
+    assert f"between {label}." in first.evidence.text
 
 
 @pytest.mark.parametrize("outcome", ["success", "failure"])

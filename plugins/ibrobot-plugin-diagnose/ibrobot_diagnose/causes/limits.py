@@ -1,11 +1,13 @@
-"""Causes between the plan and the command: limits that are too low, and an operator who took over."""
+"""Causes between the plan and the command: limits that are too low, the guard, and an operator who took over."""
 
 from __future__ import annotations
 
+import json
 from typing import override
 
 import numpy as np
 
+from ibrobot_core.api import NS_PER_S
 from ibrobot_diagnose.cause import Cause, Evidence, Reference, likelihood
 from ibrobot_diagnose.course import course_of, operated_share
 from ibrobot_diagnose.window import Window
@@ -48,6 +50,46 @@ class LimitsLow(Cause):
         return Evidence(text, 100 * share, "%", 8.0, likelihood(share * min(1.0, furthest / 0.05), 0.08, 0.3), since)
 
 
+class GuardHeld(Cause):
+    """The guard kept the arm from where it was sent."""
+
+    name = "guard_held"
+    title = "the guard let the arm go where it was sent"
+    needs = frozenset({"guard", "commands"})
+    explains = frozenset({"arm_not_following", "limits_low", "stands_still"})
+    remedy = (
+        "Move what is in the way, or correct its place and size in the section `world`. If the arm is meant to touch "
+        "it, say so: `may_touch` of the object, or `may_touch` and `free` of `control.guard`."
+    )
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        end_ns = int(window.ticks_ns[-1]) if len(window.ticks_ns) else 0
+        held: dict[str, int] = {}
+        begins = [since for since, _ in window.guarded[1:]] + [end_ns]
+        for (since, label), until in zip(window.guarded, begins, strict=True):
+            if label:
+                pair = _pair(label)
+                held[pair] = held.get(pair, 0) + max(0, until - since)
+        if not held or not window.seconds:
+            return None
+        share = sum(held.values()) / NS_PER_S / window.seconds
+        pairs = sorted(held, key=lambda each: -held[each])
+        text = f"The guard held the arm back in {100 * share:.0f} % of the run, mostly between {pairs[0]}."
+        first_ns = next(since for since, label in window.guarded if label)
+        details = tuple(f"{pair}: {held[pair] / NS_PER_S:.1f} s" for pair in pairs[:5])
+        return Evidence(text, 100 * share, "%", 5.0, likelihood(share, 0.05, 0.15), window.since(first_ns), details)
+
+
+def _pair(label: str) -> str:
+    """The two things that a label names; the label if it does not."""
+    try:
+        read = json.loads(label)
+        return f"{read['first']} and {read['second']}"
+    except (LookupError, TypeError, ValueError):
+        return label
+
+
 class Takeover(Cause):
     """An operator had the arm."""
 
@@ -68,4 +110,4 @@ class Takeover(Cause):
         return Evidence(text, 100 * share, "%", 20.0, likelihood(share, 0.2, 0.8), since)
 
 
-CAUSES: tuple[type[Cause], ...] = (LimitsLow, Takeover)
+CAUSES: tuple[type[Cause], ...] = (LimitsLow, GuardHeld, Takeover)
