@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import builtins
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+import re
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal
 
 import attrs
 
-from ibrobot_core.options import NoOptions, OptionFault, OptionName, documented, option
+from ibrobot_core.options import NoOptions, OptionFault, OptionName, documented, mistakes, option
 
 if TYPE_CHECKING:
     from ibrobot_core import interfaces
@@ -88,6 +89,16 @@ class Descriptor[T]:
     """Whether other programs can call a service of the run, by its name, through a component with these options."""
     default: bool = attrs.field(default=False, kw_only=True)
     """Whether commands use this type by default; at most one type of each kind."""
+
+    def mistakes(self) -> Iterator[str]:
+        """What is wrong with it, in words for its author."""
+        if not re.fullmatch(r"[A-Za-z0-9][\w.-]*", self.type):
+            yield f"type {self.type!r} is no name: use letters, digits and _, e.g. my_arm"
+        if not callable(self.make):
+            yield f"make is {self.make!r}: give a class, or a function that makes the object"
+        if lacking := sorted(getattr(self.make, "__abstractmethods__", ())):
+            yield f"make is an abstract class: it lacks {', '.join(lacking)}"
+        yield from (f"options: {mistake}" for mistake in mistakes(self.options))
 
     def fits(self, section: builtins.type[ComponentConfig]) -> bool:
         """Whether it may be used in a section of its kind."""

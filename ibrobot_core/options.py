@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any
 
@@ -151,6 +151,24 @@ def fields(kind: type[Any]) -> Mapping[str, attrs.Attribute[Any]]:
             for field in keys
         }
     return _FIELDS[kind]
+
+
+def mistakes(kind: Any) -> Iterator[str]:
+    """What is wrong with an options class, in words for its author."""
+    if not (isinstance(kind, type) and attrs.has(kind)):
+        yield f"{kind!r} is no attrs class: decorate it with @attrs.frozen"
+        return
+    if kind.__hash__ is None:  # as of `attrs.define`
+        yield f"{kind.__name__} can be changed: decorate it with @attrs.frozen"
+    for field in attrs.fields(kind):
+        default = default_of(field)
+        try:
+            if field.validator and default is not attrs.NOTHING:
+                field.validator(kind, field, default)
+        except (ValueError, TypeError) as error:
+            yield f"the default of {kind.__name__}.{field.alias} fails its own check: {error}"
+        except AttributeError:
+            continue  # its check needs the whole object
 
 
 def default_of(field: attrs.Attribute[Any]) -> Any:

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from difflib import get_close_matches
 from functools import cache, partial
+from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -113,6 +114,8 @@ class Registry:
     command_packages: dict[str, str] = attrs.field(factory=dict)
     """Command -> the package that offers it."""
     managers: dict[str, pluggy.PluginManager] = attrs.field(factory=dict)
+    doubles: dict[tuple[str, str], list[str]] = attrs.field(factory=dict)
+    """Kind (or `command`) and type (or name) -> the packages that offer it, if these are several."""
 
     @property
     def all_kinds(self) -> dict[str, str]:
@@ -137,9 +140,21 @@ class Registry:
         Raises:
             PluginError: if no installed plugin provides it; names the package to install, or the broken plugin.
         """
-        if (entry := self.entries.get((kind, type_))) is None:
+        if (entry := self.entries.get((kind, type_))) is None or (kind, type_) in self.doubles:
             raise self.not_found(kind, type_)
         return entry.descriptor
+
+    def create(self, kind: str, type_: str, *arguments: Any) -> Any:
+        """An object of a type, made of options and context.
+
+        Raises:
+            PluginError: as `find`, or if `make` of the descriptor returns something else.
+        """
+        made = self.find(kind, type_).make(*arguments)
+        wanted = getattr(import_module("ibrobot_core.interfaces"), kind.capitalize(), object)
+        if made is None or not isinstance(made, wanted):
+            raise PluginError(f"make of {plugin_type(kind, type_)} returned {made!r}, which is no {wanted.__name__}")
+        return made
 
     def command(self, name: str) -> descriptors.Command:
         """A command.
@@ -147,7 +162,7 @@ class Registry:
         Raises:
             PluginError: if no installed plugin offers it; names the package to install, or the broken plugin.
         """
-        if name not in self.commands:
+        if name not in self.commands or ("command", name) in self.doubles:
             raise self.not_found("command", name.partition(" ")[0])
         return self.commands[name]
 
@@ -244,6 +259,9 @@ class Registry:
 
     def not_found(self, kind: str, type_: str) -> PluginError:
         """The error for an unavailable type or command (kind `command`), with the package to install or to repair."""
+        if packages := self.doubles.get((kind, type_)):
+            both = " and ".join(packages)
+            return PluginError(f"{plugin_type(kind, type_)} is offered by {both}: uninstall all but one of them")
         package = next((name for name, offers in official_plugins().items() if type_ in offers.get(kind, ())), None)
         for failure in self.failures:
             if failure.package == package:
@@ -316,6 +334,8 @@ def _check_names(plugin: Any, kinds: Iterable[descriptors.Kind]) -> None:
     known = {name for name in vars(hookspecs) if name.startswith("ibrobot_")} | {kind.hook for kind in kinds}
     for name in vars(plugin) if isinstance(plugin, ModuleType) else dir(plugin):
         hook: Any = getattr(plugin, name) if name.startswith("ibrobot_") and name not in known else None
+        if name in known and callable(written := getattr(plugin, name)) and not hasattr(written, "ibrobot_impl"):
+            raise ValueError(f"{name} is not marked with @hookimpl")
         if hasattr(hook, "ibrobot_impl") and not hook.ibrobot_impl["optionalhook"]:
             close = get_close_matches(name, known, 1)
             raise ValueError(f"unknown hook {name!r}" + (f", did you mean {close[0]!r}?" if close else ""))
@@ -326,13 +346,18 @@ def _offered(manager: pluggy.PluginManager, hook: str, expected: type[Any] | Non
     if expected is None:
         names = {"Iterable": list, "descriptors": descriptors}
         (expected,) = get_args(get_type_hints(getattr(hookspecs, hook), names)["return"])
-    offers = [each for result in getattr(manager.hook, hook)() for each in result]
+    caller = getattr(manager.hook, hook)
+    if len(results := caller()) < len(caller.get_hookimpls()):
+        raise TypeError("it returned None: yield what it offers")
+    offers = [each for result in results for each in result]
     for each in offers:
         if not isinstance(each, expected):
             raise TypeError(f"expected a {expected.__name__}, got {each!r}")
         for field in attrs.fields(type(each)):
             if not isinstance(value := getattr(each, field.name), _CLASSES.get(field.type, object)):
                 raise TypeError(f"{expected.__name__}.{field.alias} must be a {field.type}, not {value!r}")
+        for mistake in each.mistakes() if isinstance(each, descriptors.Descriptor) else ():
+            raise TypeError(f"{expected.__name__} {each.type!r}: {mistake}")
     ((plugin, _),) = manager.list_name_plugin()
     return [attrs.evolve(each, **_contained(each, f"plugin {plugin!r} failed in %s of {hook}: %s")) for each in offers]
 
@@ -382,6 +407,8 @@ class _Plugin:
 
     def load(self, registry: Registry) -> None:
         """Import it, and register its kinds."""
+        if made_for := self.entry.group.removeprefix(ENTRY_POINT_GROUP):
+            raise PluginError(f"it needs version {made_for[1:]} of the plugin interface; {CORE} has 1: update {CORE}")
         loaded = self.entry.load()
         self.stage = "hooks"
         self.manager.register(loaded, self.name)
@@ -398,6 +425,8 @@ class _Plugin:
             self.manager.add_hookspecs(type(kind.name, (), {kind.hook: hookspecs.hookspec(lambda: ())}))
         ((_, loaded),) = self.manager.list_name_plugin()
         _check_names(loaded, kinds)
+        if not self.manager.get_hookcallers(loaded):
+            raise ValueError(f"{self.entry.value} has no hooks: functions that are marked with @hookimpl")
         self.manager.check_pending()
         classes = {kind.hook: kind.descriptor for kind in kinds}
         offers: dict[str, list[Any]] = {}
@@ -407,17 +436,22 @@ class _Plugin:
             for each in offers[hook]:
                 entry = Entry(name, each, self.name, self.package, self.version)
                 if (other := registry.entries.setdefault((name, each.type), entry)) is not entry:
-                    self.refuse(registry, f"{name} type {each.type!r} is offered by {other.package} already", hook)
+                    self.double(registry, name, each.type, other.package, hook)
         for name in ("readers", "decoders", "configs", "panels", "guides"):
             getattr(registry, name).extend(offers[f"ibrobot_{name}"])
         for each in offers["ibrobot_commands"]:
             if registry.commands.setdefault(each.name, each) is each:
                 registry.command_packages[each.name] = self.package
             else:
-                owner = registry.command_packages[each.name]
-                self.refuse(registry, f"command {each.name!r} is offered by {owner} already", "ibrobot_commands")
+                self.double(registry, "command", each.name, registry.command_packages[each.name], "ibrobot_commands")
         registry.features |= {each.name: each for each in offers["ibrobot_features"]}
         registry.managers[self.name] = self.manager
+
+    def double(self, registry: Registry, kind: str, name: str, owner: str, hook: str) -> None:
+        """Register that another package offers it, too. It is refused where it is used; what core offers stays."""
+        if owner != CORE:
+            registry.doubles.setdefault((kind, name), [owner]).append(self.package)
+        self.refuse(registry, f"{plugin_type(kind, name)} is offered by {owner} already", hook)
 
     def refuse(self, registry: Registry, reason: str, stage: str = "ibrobot_kinds") -> None:
         """Register that one of its offers is not used."""
@@ -433,7 +467,7 @@ def discover(points: Iterable[EntryPoint] | None = None) -> Registry:
     Raises:
         PluginError: if the installation of core lacks its entry point, as one from before it had one.
     """
-    installed = entry_points(group=ENTRY_POINT_GROUP)
+    installed = [entry for entry in entry_points() if entry.group.partition(".")[0] == ENTRY_POINT_GROUP]
     own = [entry for entry in installed if entry.dist is not None and entry.dist.name == CORE]
     if not own:
         raise PluginError(

@@ -52,7 +52,9 @@ def test_a_good_plugin_works_beside_broken_ones(registry: Registry) -> None:
     entry = registry.entries["hardware", "good_arm"]
 
     assert (entry.package, entry.version, entry.plugin) == ("fake-good", "1.0", "fake_good")
-    assert registry.find("hardware", "good_arm").summary == "an arm that works"
+    assert entry.descriptor.summary == "an arm that works"
+    with pytest.raises(PluginError, match="'good_arm' is offered by fake-good and fake-twin: uninstall all but one of"):
+        registry.find("hardware", "good_arm")
     assert [config.name for config in registry.configs] == ["good", "other"]
     assert registry.types("executor") == ["position"]
 
@@ -84,15 +86,17 @@ def test_two_commands_of_one_name_are_a_failure_of_the_later_plugin(site: Site) 
     assert registry.command_packages["doctor"] == "ibrobot-core"
     assert [str(failure) for failure in registry.failures] == [
         "plugin 'fake_first' (fake-first) failed in ibrobot_commands: "
-        "command 'doctor' is offered by ibrobot-core already",
+        "ibrobot doctor is offered by ibrobot-core already",
         "plugin 'fake_second' (fake-second) failed in ibrobot_commands: "
-        "command 'doctor' is offered by ibrobot-core already",
+        "ibrobot doctor is offered by ibrobot-core already",
         "plugin 'fake_second' (fake-second) failed in ibrobot_commands: "
-        "command 'juggle' is offered by fake-first already",
+        "ibrobot juggle is offered by fake-first already",
     ]
     shown = _ibrobot("plugins")
     assert f"broken: {registry.failures[2]}\n" in shown.stdout
-    assert _ibrobot("juggle", "--help").returncode == 0
+    with pytest.raises(PluginError, match="ibrobot juggle is offered by fake-first and fake-second: uninstall all but"):
+        registry.command("juggle")
+    assert registry.command("doctor").summary != "juggles, as fake_first does"
 
 
 def test_a_plugin_defines_a_kind_that_others_offer(site: Site) -> None:
@@ -132,7 +136,7 @@ def test_two_definitions_of_a_kind_and_wrong_offers_are_failures(site: Site) -> 
 
 
 def test_core_without_its_entry_point_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ibrobot_core.plugins.entry_points", lambda group: [])
+    monkeypatch.setattr("ibrobot_core.plugins.entry_points", lambda: [])
     with pytest.raises(PluginError, match="the installed ibrobot-core has no plugin of its own: install it again"):
         discover([])
 

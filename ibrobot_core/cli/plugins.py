@@ -67,7 +67,8 @@ class ShowPlugin:
 
 
 def _row(registry: Registry, entry: Entry) -> dict[str, Any]:
-    missing = registry.missing(entry.kind, entry.descriptor.type)
+    key = entry.kind, entry.descriptor.type
+    missing = None if key in registry.doubles else registry.missing(*key)
     lacking = missing and {"what": missing.missing, "apt": list(missing.apt), "remedy": missing.remedy}
     return {
         "kind": entry.kind,

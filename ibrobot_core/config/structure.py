@@ -285,8 +285,9 @@ class SectionParser:
         value: Mapping[str, Any],
         faults: Faults,
     ) -> Any:
-        own = fields(kind)
-        known = {name: field for name, field in fields(descriptor.options).items() if name not in own}
+        own, known = fields(kind), fields(descriptor.options)
+        for name in own.keys() & known.keys():
+            faults.add((), f"the plugin calls an option {name!r}, which is a key of every section of its kind")
         for name in value:
             if name not in own and name not in known:
                 others = [other for other in self.registry.of_kind(kind.plugin_kind) if name in fields(other.options)]

@@ -26,7 +26,7 @@ def build_core(config: RobotConfig, registry: Registry, clock: Clock, seed: int)
     def make(kind: str, component: ComponentConfig, name: str, joints: tuple[str, ...]) -> Any:
         options = simulation.options if simulation is not None else None
         context = Context.of(config, name, clock, seed, joints=joints, simulation=options)
-        return registry.find(kind, component.type).make(component.options, context)
+        return registry.create(kind, component.type, component.options, context)
 
     executors = {name: make("executor", each, name, each.joints) for name, each in config.executors.items()}
     if simulation is not None:

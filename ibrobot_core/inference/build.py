@@ -16,7 +16,6 @@ def build_policy(config: RobotConfig, registry: Plugins, name: str, seed: int = 
         PolicyError: e.g. for a checkpoint without its statistics.
     """
     model = config.models[name]
-    policy: Policy = registry.find("policy", model.type).make(
-        model.options, Context.of(config, name, RealClock(), seed)
-    )
+    context = Context.of(config, name, RealClock(), seed)
+    policy: Policy = registry.create("policy", model.type, model.options, context)
     return policy

@@ -173,7 +173,7 @@ class Session:
         """Make a component of the YAML by its plugin; `name` and `more` go into the context."""
         given = {"bus": self.bus, "keys": self.request.keys, **more}
         context = Context.of(self.config, name, self.clock, self.request.seed, **given)
-        return self.registry.find(kind, component.type).make(component.options, context)
+        return self.registry.create(kind, component.type, component.options, context)
 
     def take_state(self, state: run_state.ControlState) -> None:
         """Set the newest state, and wake those who wait for it."""

@@ -1,0 +1,139 @@
+"""Mistakes that a plugin's author makes are named when it is discovered, and what it offers is not used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ibrobot_core.config import load_config
+from ibrobot_core.errors import ConfigError, PluginError
+from ibrobot_core.plugins import discover
+
+if TYPE_CHECKING:
+    from ibrobot_testing.site import Site
+
+HEAD = """
+import attrs
+from ibrobot_core.api import HardwareDescriptor, Teleop, TeleopDescriptor, SensorDescriptor, hookimpl, option
+
+
+@attrs.frozen
+class Options:
+    gain: float = option(1.0, ge=0)
+
+
+class Wave:
+    pass
+"""
+YIELDS = """
+
+@hookimpl
+def ibrobot_teleop():
+    yield TeleopDescriptor("wave", Wave, "waves", options=Options)
+"""
+OPTIONS = "option(1.0, ge=0)"
+MISTAKES = {
+    "empty type": ('"wave"', '""', "type '' is no name: use letters, digits and _, e.g. my_arm"),
+    "type with a blank": ('"wave"', '"my wave"', "type 'my wave' is no name"),
+    "type with an escape": ('"wave"', r'"wave\033[1m"', r"type 'wave\x1b[1m' is no name"),
+    "no make": ("Wave,", "None,", "make is None: give a class, or a function that makes the object"),
+    "abstract class": ("Wave,", "Teleop,", "make is an abstract class: it lacks connect, disconnect, read"),
+    "options of a plain class": ("@attrs.frozen", "", "options: <class 'fake_wave.Options'> is no attrs class"),
+    "options that change": ("@attrs.frozen", "@attrs.define", "options: Options can be changed: decorate it with"),
+    "options of no class": ("options=Options", "options=Options()", "must be a builtins.type[Any], not Options(gain="),
+    "default out of range": (
+        OPTIONS, "option(-1.0, ge=0)", "options: the default of Options.gain fails its own check: -1.0 is too small",
+    ),
+    "default of no choice": (OPTIONS, "option('x', choices=('a', 'b'))", "fails its own check: 'x' is not one of: a"),
+    "sensor of the hook of devices": ("TeleopDescriptor(", "SensorDescriptor(", "expected a TeleopDescriptor, got "),
+    "nothing yielded": ("    yield ", "    ", "it returned None: yield what it offers"),
+    "no marks": ("@hookimpl", "", "ibrobot_teleop is not marked with @hookimpl"),
+    "no hooks": (YIELDS, "", "fake_wave has no hooks: functions that are marked with @hookimpl"),
+}  # fmt: skip
+
+
+def offer(site: Site, tmp_path: Path, source: str, name: str = "fake-wave") -> None:
+    file = tmp_path / f"{name}.py"
+    file.write_text(source)
+    site.add(name, file)
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistake_is_named_with_its_package(site: Site, tmp_path: Path, mistake: str) -> None:
+    right, wrong, message = MISTAKES[mistake]
+    source = HEAD + YIELDS
+    assert right in source
+    offer(site, tmp_path, source.replace(right, wrong))
+    registry = discover(site.entry_points())
+
+    (failure,) = registry.failures
+    assert message in str(failure)
+    assert str(failure).startswith("plugin 'fake_wave' (fake-wave) ")
+    with pytest.raises(PluginError, match="fake-wave"):  # where it is asked for
+        registry.find("teleop", "wave")
+
+
+def test_plugin_without_mistakes_is_used(site: Site, tmp_path: Path) -> None:
+    offer(site, tmp_path, HEAD + YIELDS)
+    registry = discover(site.entry_points())
+    assert registry.failures == []
+    assert registry.find("teleop", "wave").summary == "waves"
+
+
+def test_types_of_two_packages_are_refused_where_they_are_used(site: Site, tmp_path: Path) -> None:
+    for name in ("fake-one", "fake-two"):
+        offer(site, tmp_path, HEAD + YIELDS, name)
+    registry = discover(site.entry_points())
+    assert str(registry.failures[0]).endswith("teleop type 'wave' is offered by fake-one already")
+    with pytest.raises(PluginError, match="'wave' is offered by fake-one and fake-two: uninstall all but one of them"):
+        registry.find("teleop", "wave")
+
+
+def test_type_of_core_stays_that_of_core(site: Site, tmp_path: Path) -> None:
+    source = HEAD.replace("HardwareDescriptor", "ExecutorDescriptor") + YIELDS.replace(
+        "ibrobot_teleop", "ibrobot_executors"
+    )
+    offer(site, tmp_path, source.replace('TeleopDescriptor("wave"', 'ExecutorDescriptor("position"'))
+    registry = discover(site.entry_points())
+    assert str(registry.failures[0]).endswith("executor type 'position' is offered by ibrobot-core already")
+    assert registry.entries["executor", "position"].package == "ibrobot-core"
+    assert registry.find("executor", "position").summary != "waves"
+
+
+def test_plugin_for_another_version_of_the_interface_says_what_to_update(site: Site, tmp_path: Path) -> None:
+    offer(site, tmp_path, "raise RuntimeError('not imported')")
+    entry = site.folder / "fake_wave-1.0.dist-info/entry_points.txt"
+    entry.write_text(entry.read_text().replace("[ibrobot]", "[ibrobot.2]"))
+    (failure,) = discover(site.entry_points()).failures
+    assert str(failure) == (
+        "plugin 'fake_wave' (fake-wave) failed to import: PluginError: it needs version 2 of the plugin interface; "
+        "ibrobot-core has 1: update ibrobot-core"
+    )
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        ("None", "make of teleop type 'wave' returned None, which is no Teleop"),
+        ("Wave()", "make of teleop type 'wave' returned <fake_wave.Wave object at "),
+    ],
+)
+def test_make_of_something_else_is_named(site: Site, tmp_path: Path, made: str, message: str) -> None:
+    offer(site, tmp_path, HEAD + YIELDS.replace("Wave,", f"lambda options, ctx: {made},"))
+    registry = discover(site.entry_points())
+    with pytest.raises(PluginError, match=message):
+        registry.create("teleop", "wave", None, None)
+
+
+def test_option_that_hides_a_key_of_its_section_is_named(site: Site, tmp_path: Path) -> None:
+    source = HEAD.replace("gain: float", "joints: float") + YIELDS.replace("TeleopDescriptor", "HardwareDescriptor")
+    offer(site, tmp_path, source.replace("ibrobot_teleop", "ibrobot_hardware"))
+    robot = tmp_path / "robot.yaml"
+    robot.write_text(
+        "robot: {name: r, joints: [{name: pan, lower: -1, upper: 1, max_velocity: 1, max_acceleration: 1}]}\n"
+        "hardware: {arm: {type: wave, joints: [pan]}}\n"
+    )
+    with pytest.raises(ConfigError, match="the plugin calls an option 'joints', which is a key of every section of"):
+        load_config(robot, registry=discover(site.entry_points()))
