@@ -67,6 +67,7 @@ class ControlCore:
         self._hardware = hardware
         self._clock = clock
         self.period_ns = ns(1.0 / config.control.rate_hz)
+        self._guard = guard
         self._safety = SafetyLayer(config.robot, self.period_ns, guard)
         self._overruled = ""
         self._pose = PoseMotion(self._safety, clock)
@@ -255,6 +256,7 @@ class ControlCore:
         """Counts of all interventions and refusals by the safety layer, the executors, the hardware and the loop."""
         return {
             "safety": dict(self._safety.counters()),
+            "guard": {} if self._guard is None else dict(self._guard.counts),
             "joints": dict(self._safety.interventions),
             "executors": self._executors.counters(),
             "hardware": self._hardware.counters(),

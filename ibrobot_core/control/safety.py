@@ -187,8 +187,7 @@ class SafetyLayer:
 
     def counters(self) -> Mapping[str, int]:
         """Counts since construction: joint-ticks for each of `KINDS`, `outside` joints, refused and missing vectors."""
-        of_guard = {} if self._guard is None else {f"guard_{k}": n for k, n in self._guard.counts.items()}
-        return dict(zip(KINDS, self._counts.sum(axis=1).tolist(), strict=True)) | self._events | of_guard
+        return dict(zip(KINDS, self._counts.sum(axis=1).tolist(), strict=True)) | self._events
 
     @property
     def interventions(self) -> Mapping[str, int]:

@@ -361,6 +361,7 @@ class Session:
         counters: Mapping[str, Any] = report["counters"]
         groups = {"loop": {**report["loop"], **counters.get("loop", {})}, "safety": counters.get("safety", {})}
         groups["interventions"] = counters.get("joints", {})
+        groups |= {"guard": values for values in [counters.get("guard")] if values}
         groups |= {f"executor {name}": values for name, values in counters.get("executors", {}).items()}
         groups |= {f"hardware {name}": values for name, values in counters.get("hardware", {}).items()}
         if self.acting is not None:

@@ -180,3 +180,10 @@ class TestInControl:
         self.guard.say = lambda setpoint: np.array([at[0], at[1], setpoint[2]])
         rig.tick()
         assert noted == [(("pan", "lift"), LABEL)]
+
+    def test_its_counts_are_a_group_of_their_own(self, rig) -> None:
+        self.guard.counts = {"ticks": 3, "pairs": 302}
+        rig.start()
+        counters = rig.core.counters()
+        assert counters["guard"] == {"ticks": 3, "pairs": 302}
+        assert not {"guard_pairs", "pairs", "ticks"} & counters["safety"].keys(), "evaluations add these up"
