@@ -89,7 +89,7 @@ def status_json(session: RunView, log: LogLines, pages: int) -> dict[str, Any]:
     return {
         "robot": robot_json(session),
         "mode": session.mode, "jogs": _jogs(session),
-        "held": session.to_go_on() if held else "",
+        "held": session.to_go_on() if held else "", "guard": dict(session.guarded),
         "faults": [{"text": fault, "remedy": "Remove the cause, then reset."} for fault in session.faults],
         "all_faults": len(session.outcome.faults), "failure": session.failure_text,
         "conditions": [{name: str(value) for name, value in each.items()} for each in conditions],

@@ -34,7 +34,7 @@ from ibrobot_core.api import (
     String,
     Vector3,
 )
-from ibrobot_core.app import Channel, PanelDescriptor, RunView
+from ibrobot_core.app import Channel, Guard, PanelDescriptor, RunView
 
 
 def gradient(encoding: str) -> Image:
@@ -121,6 +121,14 @@ def test_the_status_of_a_run_is_json_without_nan() -> None:
     text = json.dumps(status, allow_nan=False)
     assert json.loads(text)["robot"]["joints"][0]["name"] == "shoulder_pan"
     assert plan_json(session, 0) == {"joints": [], "rows": []}
+
+
+def test_the_status_names_what_the_guard_keeps_apart() -> None:
+    session = make_session()
+    assert status_json(session, LogLines(), 1)["guard"] == {}
+    session.guarded = Guard.read('{"first": "hand", "second": "wall", "distance": 0.0031}')
+    guard = status_json(session, LogLines(), 1)["guard"]
+    assert (guard["first"], guard["second"], guard["text"]) == ("hand", "wall", "hand was 3.1 mm from wall")
 
 
 def test_pages_that_only_watch_see_no_token_in_the_log() -> None:

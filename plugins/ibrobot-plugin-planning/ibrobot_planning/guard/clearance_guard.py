@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any, override
 
@@ -16,7 +17,6 @@ from ibrobot_planning.guard.building import Building, Finished
 from ibrobot_planning.guard.changes import WorldChange
 from ibrobot_planning.guard.options import ClearanceGuardOptions
 from ibrobot_planning.guard.pairs import Indices, Pairs
-from ibrobot_planning.guard_label import label
 from ibrobot_planning.world.arm import Arm, sorted_pair
 from ibrobot_planning.world.checked_arm import may_touch_arm
 from ibrobot_planning.world.objects import FLOOR, Plane, World, WorldObject
@@ -103,7 +103,7 @@ class ClearanceGuard(Guard):
         self._pair = ()
         if self._stale and self._options.when_stale == "hold" and not np.array_equal(setpoint, brakes):
             self._counts["stale"] += 1
-            self.overruled = label("world", self._stale, None)
+            self.overruled = _label("world", self._stale, None)
             return brakes
         extra = self._pairs.levers @ self._away
         blocking = self._blocking(position, setpoint, extra)
@@ -114,7 +114,7 @@ class ClearanceGuard(Guard):
         self._pair = self._pairs.names[nearest]
         if self._pair != before:
             alike = np.flatnonzero([names == self._pair for names in self._pairs.names])
-            self._label = label(*self._pair, float(self._pairs.distances(position, alike).min()))
+            self._label = _label(*self._pair, float(self._pairs.distances(position, alike).min()))
         self.overruled = self._label
         lowest, highest = np.minimum(brakes, setpoint), np.maximum(brakes, setpoint)
         for _ in range(_ROUNDS):
@@ -216,3 +216,8 @@ class ClearanceGuard(Guard):
         )
         made.estimate(self._begin)
         return made
+
+
+def _label(first: str, second: str, distance: float | None) -> str:
+    """As `overruled`: two things and their distance [m], or `world` and why it is not known well enough."""
+    return json.dumps({"first": first, "second": second, "distance": None if distance is None else round(distance, 4)})

@@ -169,8 +169,9 @@ function showFaults() {
   const absent = status?.absent ?? [], conditions = status?.conditions ?? [];
   const ended = status?.ended ?? false;
   const lost = page.connected === false && !ended;
+  const guard = status?.guard?.text ?? "";
   const unconfirmed = page.unconfirmed ?? "";
-  refresh($("faults"), { ended, lost, unconfirmed, estop, faults, held, failure, absent, conditions, operating: page.operating }, () => {
+  refresh($("faults"), { ended, lost, unconfirmed, estop, faults, held, guard, failure, absent, conditions, operating: page.operating }, () => {
     const reset = () => h("button", { onclick: () => page.command("reset"), disabled: !page.operating }, "Reset");
     return [
       unconfirmed ? h("div", { class: "fault alarm" }, h("strong", {}, "The robot may not have stopped: "), h("span", {},
@@ -183,6 +184,7 @@ function showFaults() {
       held ? h("div", { class: "warning" }, h("strong", {}, "Holding: "), h("span", {}, held),
         h("button", { onclick: () => page.call("/set_mode", page.status.mode), disabled: !page.operating }, "Go on"))
         : null,
+      guard ? h("div", { class: "warning" }, h("strong", {}, "The guard holds the arm back: "), h("span", {}, guard)) : null,
       failure ? h("div", { class: "fault" }, h("strong", {}, "The run ended: "), h("span", {}, failure)) : null,
       ended && !failure ? h("div", { class: "ended" }, h("strong", {}, "The run has ended"), h("span", {}, results(status)), ...onwards(status)) : null,
       ...conditions.map((each) => h("div", { class: "warning" },
@@ -235,6 +237,9 @@ page.stream.addEventListener("status", ({ detail: status }) => {
   const objects = JSON.stringify(status.objects);
   if (objects !== page.objects) view.tell({ do: "objects", objects: status.objects });
   page.objects = objects;
+  const near = [status.guard?.first, status.guard?.second].filter(Boolean);
+  if (String(near) !== String(page.near ?? [])) view.tell({ do: "near", names: near });
+  page.near = near;
   if (first) view.tell({ do: "joints", names: status.robot.joints.map((joint) => joint.name) });
   update();
 });

@@ -12,6 +12,7 @@ const GHOST_RAD = 0.03; // a command this close to the measured position has no 
 const FIELD_DEG = 40;
 const WIDE = 1.3; // width by height of a picture below which it counts as narrow
 const FRUSTUM_M = 0.05;
+const NEAR = [0.93, 0.33, 0.2, 1]; // what the guard keeps apart
 const OBJECT = [0.55, 0.6, 0.66, 0.75];
 const FRAME_MS = 40; // 25 frames a second leave a small machine time for the rest
 const SLOW_FRAME_MS = 100; // without a graphics card, each costs processor time that control may need
@@ -22,6 +23,7 @@ let measured = null, commanded = null, planned = null;
 let trail = [], path, future, grid, ball;
 let dirty = true, stamp = 0, drawn = 0, size = [1, 1], jogs = false, view = null;
 let cameras = [];
+let near = []; // names of bodies and objects that the guard keeps apart
 const shapes = new Map(); // of objects, by type and size
 let goals = false, goal = null, kept = false, begun = 0;
 const orbit = { azimuth: -0.9, elevation: 0.45, distance: 1, target: [0.1, 0, 0.15] };
@@ -102,7 +104,7 @@ const tipOf = (frames) => (tip ? transform(frames[tip.body], tip.pos) : null);
 
 function items(frames, color = null) {
   return bodies.flatMap((body, i) => body.shapes.map(({ shape, local, color: own }) => (
-    { shape, matrix: multiply(frames[i], local), color: color ?? own, lit: true })));
+    { shape, matrix: multiply(frames[i], local), color: color ?? (near.includes(body.name) ? NEAR : own), lit: true })));
 }
 
 function state({ state: message }) {
@@ -134,10 +136,10 @@ function plan({ plan: message, positions, kept: keeps = false }) {
 }
 
 function objects({ objects: found }) {
-  extras = found.map(({ type, size: sizes, pos, quat, color }) => {
+  extras = found.map(({ name, type, size: sizes, pos, quat, color }) => {
     const kind = `${type} ${sizes}`;
     if (!shapes.has(kind)) shapes.set(kind, screen.mesh(primitive(type, sizes)));
-    return { shape: shapes.get(kind), matrix: placed(pos, quat), color: color?.length ? color : OBJECT, lit: true };
+    return { name, shape: shapes.get(kind), matrix: placed(pos, quat), color: color?.length ? color : OBJECT, lit: true };
   });
   dirty = true;
 }
@@ -156,7 +158,8 @@ function draw(now = 0) {
   dirty = false;
   look();
   const gray = dark ? [0.3, 0.37, 0.43, 1] : [0.68, 0.73, 0.77, 1];
-  const shown = [{ shape: grid, matrix: identity(), color: gray }, ...extras];
+  const things = extras.map((each) => (near.includes(each.name) ? { ...each, color: NEAR } : each));
+  const shown = [{ shape: grid, matrix: identity(), color: gray }, ...things];
   if (measured) shown.push(...items(measured), { shape: path, matrix: identity(), color: [0.08, 0.47, 0.78, 1] });
   if (measured) {
     shown.push(...cameras.map(({ body, local, shape }) => (
@@ -268,6 +271,7 @@ const actions = {
   start, scene: load, state, plan, objects, size: resize, down, move, pinch, up: release,
   theme: (message) => { dark = message.dark; dirty = true; },
   turn: ({ by }) => turn(by), zoom: ({ factor }) => zoom(factor),
+  near: ({ names }) => { near = names; dirty = true; },
   joints: ({ names }) => { joints = names; },
   clear: () => {
     measured = commanded = planned = null;

@@ -25,6 +25,7 @@ export default {
   "{}. The robot holds. {}": "{}。机器人保持不动。{}",
   "Emergency stop.": "紧急停止。",
   "Holding:": "保持中：",
+  "The guard holds the arm back:": "防碰保护正在阻止机械臂：",
   "Go on": "继续",
   "The run ended:": "运行结束：",
   "The run has ended": "运行已结束",
