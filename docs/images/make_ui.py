@@ -18,8 +18,10 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests/shared"))
 
-_WIDTH = 1200
-"""Width of the page in the documentation [px]."""
+_WIDTH, _HEIGHT = 1440, 900
+"""Size of the page in the documentation [px]."""
+_MOST = 1300
+"""Largest height of a picture [px]."""
 
 
 def main() -> None:
@@ -33,12 +35,15 @@ def main() -> None:
         page.evaluate("window.scrollTo(0, 0)")
         for _ in range(100):
             shown = page.locator("main").inner_text()
-            if not ("Loading" in shown or "The server makes" in shown or page.locator(".toast").count()):
+            waits = any(each in shown for each in ("Loading", "Drawing the robot", "The server makes"))
+            if not waits and not page.locator(".toast").count():
                 break
             page.wait_for_timeout(200)
         page.wait_for_timeout(1500)
         path = here / f"ui_{name}.webp"
-        Image.open(BytesIO(page.screenshot())).save(path, quality=85)
+        whole = page.locator("#nav").count() > 0  # the page of a run fits its window
+        image = Image.open(BytesIO(page.screenshot(full_page=whole)))
+        image.crop((0, 0, image.width, min(image.height, _MOST))).save(path, quality=85)
         print(path)
 
     with tempfile.TemporaryDirectory() as made, sync_playwright() as playwright:
@@ -49,7 +54,7 @@ def main() -> None:
         own.write_text(own.read_text(encoding="utf-8").replace("max_duration_s: 20", "max_duration_s: 90"), "utf-8")
         with ui_process(folder) as address:
             chromium = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
-            page = chromium.new_context(viewport={"width": _WIDTH, "height": 800}).new_page()
+            page = chromium.new_context(viewport={"width": _WIDTH, "height": _HEIGHT}).new_page()
             page.goto(address)
             record(page, shot)
             convert(page, shot)

@@ -2,6 +2,7 @@
 
     npm pack axe-core && tar xzf axe-core-*.tgz
     uv run python plugins/ibrobot-plugin-web/tests/look.py FOLDER --axe package/axe.min.js [--only run]
+    uv run python plugins/ibrobot-plugin-web/tests/look.py FOLDER --axe package/axe.min.js --only empty --language zh-CN
 
 Writes FOLDER/STATE-SIZE-THEME.png for three sizes and for a desktop at 200 %, light and dark. Prints what axe-core
 finds serious or critical, and exits with 1 if there is any. It needs Chromium and playwright, takes ten minutes, and
@@ -26,14 +27,16 @@ sys.path.insert(0, str(Path(__file__).parents[3] / "tests/shared"))
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]
 SIZES = {
     "phone": (390, 844),
-    "zoom": (640, 400),
-    "tablet": (820, 1180),
+    "zoom": (720, 450),
+    "tablet": (1024, 768),
     "wide": (1920, 1080),
-    "desktop": (1280, 800),
+    "desktop": (1440, 900),
 }
-"""Width and height [px]; 1280x800 at 200 % has the layout of half its size. The last one stays set."""
+"""Width and height [px]; 1440x900 at 200 % has the layout of half its size. The last one stays set."""
 CHECKED = ("phone", "desktop")
 """Sizes at which axe checks: the layouts differ in these."""
+LANGUAGE = ["en"]
+"""Language of the browser; the parts that press buttons know them in English."""
 PANELS = ("Plots", "Health", "Log")
 _SETTLE_MS = 400
 WRONG = """robot:
@@ -87,7 +90,8 @@ class Look:
 def opened(chromium: Any, address: str) -> Any:
     """A page in a browser of its own."""
     width, height = SIZES["desktop"]
-    page = chromium.new_context(viewport={"width": width, "height": height}, bypass_csp=True).new_page()
+    viewport = {"width": width, "height": height}
+    page = chromium.new_context(viewport=viewport, bypass_csp=True, locale=LANGUAGE[0]).new_page()
     page.goto(address)
     return page
 
@@ -100,11 +104,11 @@ def view(page: Any, name: str) -> None:
 
 def look_at_empty(chromium: Any, look: Look) -> None:
     """`ibrobot ui` in an empty folder, without its link, and after its end."""
-    from ui_path import ui_process
+    from ui_path import ui_process, until
 
     with tempfile.TemporaryDirectory() as made, ui_process(Path(made)) as address:
         page = opened(chromium, address)
-        page.wait_for_timeout(1500)
+        until(page, "ibrobot.session.views.length")
         for name in page.evaluate("ibrobot.session.views.map(({name}) => name)"):
             view(page, name)
             look(page, f"ui-empty-{name}")
@@ -354,7 +358,9 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="for the pictures")
     parser.add_argument("--axe", type=Path, help="axe.min.js; without it nothing is checked")
     parser.add_argument("--only", choices=PARTS, action="append", help="a part of the pages")
+    parser.add_argument("--language", default=LANGUAGE[0], help="of the browser; others than en for --only empty")
     chosen = parser.parse_args()
+    LANGUAGE[0] = chosen.language
     look = Look(chosen.folder, chosen.axe.read_text(encoding="utf-8") if chosen.axe is not None else "")
     parts = [name for name in PARTS if name != "training" or find_spec("lerobot") is not None]
     for name in chosen.only or parts:

@@ -37,7 +37,6 @@ def test_a_table_fits_the_code(table: Path) -> None:
                 assert word.casefold() in code, f"{text!r} is no longer in the code"
 
 
-VIEWS = ("robots", "devices", "record", "episodes", "job-convert", "datasets", "policies", "job-eval", "jobs")
 SHOWN = """[...document.querySelectorAll('#nav, #main')].flatMap((part) => {
   const walk = document.createTreeWalker(part, NodeFilter.SHOW_TEXT), found = [];
   while (walk.nextNode()) {
@@ -65,20 +64,12 @@ def test_no_english_sentence_is_left_in_a_chinese_browser(tmp_path: Path) -> Non
         page.get_by_text("没有发现问题。").wait_for(timeout=60_000)
         assert page.evaluate("document.documentElement.lang") == "zh"
         assert page.get_by_role("link", name="数据集", exact=True).is_visible()
-        for view in (
-            "robots",
-            "devices",
-            "record",
-            "episodes",
-            "job-convert",
-            "datasets",
-            "policies",
-            "job-eval",
-            "jobs",
-        ):
+        for view in page.evaluate("ibrobot.session.views.map(({name}) => name)"):
             page.evaluate(f"location.hash = {view!r}")
-            until(page, f"document.querySelector('#view-{view}')?.isConnected")
+            until(page, f"document.querySelector('#view-{view.replace(' ', '-')}')?.isConnected")
             page.wait_for_timeout(500)
+            if view == "job-train":
+                continue  # what is missing for it, in the words of its package
             english = re.compile(r"[^\u4e00-\u9fff]*[A-Za-z]+ [a-z]+ [a-z]+[^\u4e00-\u9fff]*")
             assert [text for text in page.evaluate(SHOWN) if english.fullmatch(text)] == [], view
         browser.close()

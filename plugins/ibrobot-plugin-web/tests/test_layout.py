@@ -167,13 +167,16 @@ async def look_at_one_arm(page: Any, run: Run) -> None:
     arms = {"page_left": joints[:6], "page_right": joints[6:]}
     two["robot"]["modes"][0]["jogs"] = arms
     two["robot"]["groups"] = {"left": joints[:6], "right": joints[6:]}
-    run.show({**two, "jogs": list(arms)})
+    run.show({**two, "jogs": list(arms), "help": "jog from the page\njog from the page"})
     await until(page, "document.querySelectorAll('.joint').length === 6")
     names = page.locator(".joint .name")
     assert await names.all_inner_texts() == [name.removeprefix("left_") for name in joints[:6]]
     await page.get_by_role("button", name="right", exact=True).first.click()
     await until(page, "document.querySelector('.joint .name').title.startsWith('right_')")
     assert await names.all_inner_texts() == [name.removeprefix("right_") for name in joints[6:]]
+    await page.keyboard.press("?")
+    assert await page.locator("#dialog pre").inner_text() == "jog from the page", "once for both arms"
+    await page.get_by_role("button", name="Close").click()
     run.show(status())
     await until(page, "!document.querySelector('.joint .name').title.startsWith('right_')")
 

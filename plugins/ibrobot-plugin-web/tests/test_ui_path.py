@@ -48,8 +48,14 @@ def test_from_a_robot_to_its_dataset_by_clicks_alone(tmp_path: Path) -> None:
         page.on("request", lambda request: hosts.add(request.url.split("/")[2]))
         page.goto(address)
         page.get_by_text("No problems found.").wait_for(timeout=60_000)
+        for name in page.evaluate("ibrobot.session.views.map(({name}) => name)"):
+            page.locator(f"#nav [data-name='{name}']").click()
+            page.locator(f"#view-{name.replace(' ', '-')}").wait_for(state="attached")
+        page.get_by_role("link", name="Robots", exact=True).click()
+        page.get_by_text("No problems found.").wait_for()
+        assert page.get_by_label("Robot", exact=True).input_value() == "my_arm.yaml", "one's own, not a shipped one"
         with held(page, "**/api/robots/check?*"):
-            page.get_by_label("Robot", exact=True).select_option("my_arm.yaml")
+            page.get_by_label("Robot", exact=True).select_option("so101")
             assert page.get_by_role("button", name="Launch").is_disabled()
         record(page)
         with held(page, "**/api/jobs/form?*"):

@@ -118,10 +118,11 @@ $("theme").addEventListener("click", switchTheme);
 // Which keys do something now.
 function showKeys() {
   const keys = [...page.role === "watch" ? [] : [["Esc", "emergency stop"]], ...record.keys, ...pictures.keys, ["?", "this list"]];
+  const devices = [...new Set((page.status?.help ?? "").split("\n"))].map(words).join("\n"); // two arms say the same
   const dialog = $("dialog");
   dialog.replaceChildren(h("h2", { id: "dialog-title" }, "Keys that are active now"),
     table(null, keys.map(([key, does]) => row([h("th", { scope: "row" }, h("kbd", {}, key)), does]))),
-    page.status?.help ? h("pre", {}, page.status.help) : "",
+    devices ? h("pre", {}, devices) : "",
     h("form", { method: "dialog", class: "row" }, h("button", { autofocus: true }, "Close")));
   dialog.showModal();
 }

@@ -114,9 +114,9 @@ window.ibrobot = ui; // for tests and for the console
 
 // The address after # is VIEW or VIEW/REST; a view gets the rest.
 function address() {
-  const [name, ...rest] = location.hash.slice(1).split("/");
+  const [name, ...rest] = location.hash.slice(1).split("/").map(decodeURIComponent); // the name of a command has blanks
   const known = ui.session.views.some((view) => view.name === name);
-  return known ? [name, decodeURIComponent(rest.join("/"))] : [ui.session.views[0].name, ""];
+  return known ? [name, rest.join("/")] : [ui.session.views[0].name, ""];
 }
 
 async function showView() {
@@ -136,7 +136,7 @@ async function showView() {
       const known = ui.session.views.find((view) => view.name === name);
       const { View } = await import(`./ui/${known.module}.js`);
       const view = new View(ui, known);
-      view.element = h("div", { id: `view-${name}` });
+      view.element = h("div", { id: `view-${name.replaceAll(" ", "-")}` });
       view.mount(view.element);
       views.set(name, view);
     }

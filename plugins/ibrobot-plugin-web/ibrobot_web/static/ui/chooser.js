@@ -55,7 +55,8 @@ export class Chooser {
   async load() {
     this.robots = await this.ui.attempt(() => this.ui.get("robots/list")) ?? [];
     const names = this.robots.map(({ robot }) => robot);
-    if (!names.includes(choice.robot)) Object.assign(choice, { robot: names.includes("so101") ? "so101" : names[0] ?? "", mode: "" });
+    const own = this.robots.find(({ source }) => source === "folder")?.robot;
+    if (!names.includes(choice.robot)) Object.assign(choice, { robot: own ?? (names.includes("so101") ? "so101" : names[0] ?? ""), mode: "" });
     refresh(this.robot, this.robots, () => Object.entries(SOURCES).map(([source, label]) => {
       const mine = this.robots.filter((each) => each.source === source);
       return mine.length ? h("optgroup", { label }, mine.map(({ robot }) => h("option", { value: robot }, robot))) : null;

@@ -43,7 +43,7 @@ export class Overview {
 
   robot(robot, summary, run) {
     const running = run?.state === "running";
-    const state = running ? "It runs." : run?.state === "failed" ? "Its last run failed." : run ? "Its last run has ended." : "It does not run.";
+    const state = running ? "It runs." : run?.state === "failed" ? "Its last run failed." : run ? "Its last run has ended." : "Not running.";
     return [summary, h("p", { class: running ? "good" : run?.state === "failed" ? "bad" : "note" }, state), h("div", { class: "row" },
       running && run.facts.url ? h("a", { class: "button primary", href: this.ui.runAddress(run.facts.url), target: "_blank" }, "Open its page")
         : h("button", { onclick: () => this.choose(robot), "aria-label": `Choose ${robot}` }, "Choose"))].filter(Boolean);
