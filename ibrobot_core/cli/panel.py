@@ -115,8 +115,6 @@ def plain_line(session: Session, rates: RecentRates) -> str:
         pieces.append(f"model {model}")
     pieces += _sensor_texts(session, rates)
     pieces.append(f"episodes {outcome.episodes}, successes {outcome.successes}")
-    if session.guarded:
-        pieces.append(f"the guard holds back: {session.guarded['text']}")
     pieces += [f"FAULT: {fault}" for fault in session.faults]
     if session.held:
         pieces.append(f"holding: {session.to_go_on()}")
@@ -170,8 +168,6 @@ def _facts(session: Session, rates: RecentRates) -> Iterator[tuple[str, str]]:
     outcome = session.outcome
     if session.commander:
         yield "robot", _COMMANDS[session.commander]
-    if session.guarded:
-        yield "guard", f"holds the arm back: {session.guarded['text']}"
     if session.sensors:
         yield "sensors", "  ".join(_sensor_texts(session, rates))
     if session.acting is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
@@ -21,17 +20,6 @@ class Guard(ABC):
 
     overruled: str = ""
     counts: Mapping[str, int] = {}
-
-    @staticmethod
-    def read(overruled: str) -> dict[str, Any]:
-        """What `overruled` says, and as `text` for people; only this if it is of another form."""
-        try:
-            read: dict[str, Any] = json.loads(overruled)
-            first, second, distance = (read[name] for name in ("first", "second", "distance"))
-            text = f"{first}: {second}" if distance is None else f"{first} was {1e3 * distance:.1f} mm from {second}"
-        except (LookupError, TypeError, ValueError):
-            return {"text": overruled}
-        return {**read, "text": text}
 
     @abstractmethod
     def accept(self, position: Vector, velocity: Vector, setpoint: Vector, measured: Vector) -> Vector:

@@ -15,7 +15,6 @@ from ibrobot_core.control.host import ControlClient, ControlHost, InlineControl
 from ibrobot_core.deadman import LONGEST_BRAKING_S
 from ibrobot_core.descriptors import HardwareDescriptor
 from ibrobot_core.errors import ComponentFailed, HardwareError
-from ibrobot_core.interfaces.guard import Guard
 from ibrobot_core.interfaces.run_state import ControlState
 from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import JOINT_STATES, Float64MultiArray, Header, JointState, String
@@ -128,7 +127,6 @@ class ControlComponent(Component):
             for call in (session.command_source.take_goal, *session.on_goal):
                 call(event)
         elif event["event"] == "guard":
-            session.guarded = Guard.read(event["overruled"]) if event["overruled"] else {}
             session.bus.publish("/guard", String(event["overruled"]), latched=True)
         elif event["event"] == "fault":
             fault = str(event["fault"])

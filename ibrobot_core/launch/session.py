@@ -66,7 +66,6 @@ class Session:
             simulated episode. An emergency stop never waits for it.
         commander: who commands the robot in a mode in which an operator may take it from the policy: `policy`,
             `operator`, or `handover` while neither does; empty in other modes.
-        guarded: what the guard holds the arm back from, as of `Guard.read`; empty while it does not.
         followed_ns: when the robot last followed the devices of the present mode [ns]: they command it, and it has
             reached their pose; 0 if it has not.
         held: whether the robot holds after the reset of a fault, until the operator enters the mode again.
@@ -89,7 +88,6 @@ class Session:
         self.devices = run_state.SharedDevices()
         self.changing = threading.RLock()
         self.commander = ""
-        self.guarded: Mapping[str, Any] = {}
         self.followed_ns = 0
         self.held = False
         self.start_failed = False

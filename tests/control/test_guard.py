@@ -112,19 +112,6 @@ def test_braking_asks_no_guard(brake) -> None:
     assert layer.overruled == ""
 
 
-@pytest.mark.parametrize(
-    ("overruled", "text"),
-    [
-        (LABEL, "x was 10.0 mm from y"),
-        ('{"first": "world", "second": "cloud top is 2 s old", "distance": null}', "world: cloud top is 2 s old"),
-        ("something near", "something near"), ("[1]", "[1]"), ("3", "3"), ('{"first": "x"}', '{"first": "x"}'),
-        ('{"first": "x", "second": "y", "distance": "far"}', '{"first": "x", "second": "y", "distance": "far"}'),
-    ],
-)  # fmt: skip
-def test_what_overruled_says_in_words(overruled: str, text: str) -> None:
-    assert Guard.read(overruled)["text"] == text
-
-
 class Broken(Exception):
     """What a plugin's bug may raise."""
 

@@ -74,19 +74,6 @@ def estop(run: Runtime) -> None:
         run.step()
 
 
-def test_what_the_guard_holds_the_arm_back_from_is_seen_while_it_does(runs: Runs) -> None:
-    run = runs.start("contract.max_duration_s=100", mode="policy", seed=13)
-    shown = run.session.bus.subscribe("/guard", 10)
-    terminal = Terminal(run, 80, 40)
-    for overruled, seen in (('{"first": "hand", "second": "wall", "distance": 0.0031}', True), ("", False)):
-        run.session.control._core.events.append({"event": "guard", "overruled": overruled})  # type: ignore[attr-defined]
-        run.step()
-        assert ("guard holds the arm back: hand was 3.1 mm from wall" in terminal.words()) is seen
-        line = plain_line(run.session, terminal.rates)
-        assert ("the guard holds back: hand was 3.1 mm from wall" in line) is seen
-    assert len(shown.drain()) == 2
-
-
 def test_a_message_may_come_while_the_panel_is_drawn(terminal: Terminal):
     class Interrupted:
         def __rich__(self) -> str:

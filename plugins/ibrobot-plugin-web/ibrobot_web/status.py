@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import re
@@ -13,7 +14,7 @@ from typing import Any, override
 import attrs
 import numpy as np
 
-from ibrobot_core.api import NS_PER_S, JointState, Message, Vector
+from ibrobot_core.api import NS_PER_S, JointState, Message, String, Vector
 from ibrobot_core.app import ControlState, RunView, error_text
 from ibrobot_web.messages import SERVICES
 from ibrobot_web.modes import modes_json, page_devices
@@ -89,7 +90,7 @@ def status_json(session: RunView, log: LogLines, pages: int) -> dict[str, Any]:
     return {
         "robot": robot_json(session),
         "mode": session.mode, "jogs": _jogs(session),
-        "held": session.to_go_on() if held else "", "guard": dict(session.guarded),
+        "held": session.to_go_on() if held else "", "guard": _guard(session),
         "faults": [{"text": fault, "remedy": "Remove the cause, then reset."} for fault in session.faults],
         "all_faults": len(session.outcome.faults), "failure": session.failure_text,
         "conditions": [{name: str(value) for name, value in each.items()} for each in conditions],
@@ -106,6 +107,21 @@ def status_json(session: RunView, log: LogLines, pages: int) -> dict[str, Any]:
         "episodes": session.outcome.episodes, "successes": session.outcome.successes,
         "pages": pages, "log": log.lines(), "commander": session.commander, "panels": _panels(session),
     }  # fmt: skip
+
+
+def _guard(session: RunView) -> dict[str, Any]:
+    """What the guard keeps apart now, by the newest message on `/guard`, and that in words as `text`; else empty."""
+    newest = session.bus.latched().get("/guard")
+    label = newest.message.data if newest is not None and isinstance(newest.message, String) else ""
+    try:
+        read = json.loads(label or "{}")
+        if read:
+            first, second, away = (read[name] for name in ("first", "second", "distance"))
+            text = f"{first}: {second}" if away is None else f"{first} was {1e3 * away:.1f} mm from {second}"
+            read = {"first": str(first), "second": str(second), "text": text}
+    except (LookupError, TypeError, ValueError):
+        read = {"text": label}
+    return dict(read)
 
 
 def episode_json(session: RunView) -> Any:

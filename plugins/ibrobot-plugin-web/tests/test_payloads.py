@@ -34,7 +34,7 @@ from ibrobot_core.api import (
     String,
     Vector3,
 )
-from ibrobot_core.app import Channel, Guard, PanelDescriptor, RunView
+from ibrobot_core.app import Channel, PanelDescriptor, RunView
 
 
 def gradient(encoding: str) -> Image:
@@ -123,12 +123,20 @@ def test_the_status_of_a_run_is_json_without_nan() -> None:
     assert plan_json(session, 0) == {"joints": [], "rows": []}
 
 
-def test_the_status_names_what_the_guard_keeps_apart() -> None:
+@pytest.mark.parametrize(
+    ("label", "shown"),
+    [
+        ('{"first": "hand", "second": "wall", "distance": 0.0031}', ["hand", "wall", "hand was 3.1 mm from wall"]),
+        ('{"first": "world", "second": "too old", "distance": null}', ["world", "too old", "world: too old"]),
+        ('{"first": "x", "second": "y", "distance": "far"}', ['{"first": "x", "second": "y", "distance": "far"}']),
+        ("something near", ["something near"]), ("[1]", ["[1]"]), ("3", ["3"]), ("", []),
+    ],
+)  # fmt: skip
+def test_the_status_names_what_the_guard_keeps_apart(label: str, shown: list[str]) -> None:
     session = make_session()
     assert status_json(session, LogLines(), 1)["guard"] == {}
-    session.guarded = Guard.read('{"first": "hand", "second": "wall", "distance": 0.0031}')
-    guard = status_json(session, LogLines(), 1)["guard"]
-    assert (guard["first"], guard["second"], guard["text"]) == ("hand", "wall", "hand was 3.1 mm from wall")
+    session.bus.publish("/guard", String(label), latched=True)
+    assert list(status_json(session, LogLines(), 1)["guard"].values()) == shown
 
 
 def test_pages_that_only_watch_see_no_token_in_the_log() -> None:

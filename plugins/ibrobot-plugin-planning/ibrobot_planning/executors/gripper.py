@@ -25,8 +25,8 @@ from ibrobot_core.api import (
     ns,
     seconds,
 )
-from ibrobot_core.app import Guard
 from ibrobot_planning.executors.options import GripperOptions
+from ibrobot_planning.guard_label import in_words, touches
 
 _STRONGEST = 1000.0
 """Largest `max_effort` of a goal [Nm]; 0 stands for no limit."""
@@ -150,8 +150,7 @@ class GripperExecutor(Executor):
 
     @override
     def note_guard(self, overruled: str) -> None:
-        distance = Guard.read(overruled).get("distance")
-        self._held_back = overruled if distance is None or distance > 0 else ""
+        self._held_back = "" if touches(overruled) else overruled
 
     @override
     def cancel(self, measured: JointReading) -> None:
@@ -187,7 +186,7 @@ class GripperExecutor(Executor):
             why = f"stalled at {measured.position[0]:.4g} rad on the way to {self._target:.6g}"
             if self._held_back:  # it stands before something that it does not touch
                 self._hold(measured)
-                self._end(GoalState.ABORTED, f"the guard: {Guard.read(self._held_back)['text']}", result)
+                self._end(GoalState.ABORTED, f"the guard: {in_words(self._held_back)}", result)
             elif self._options.allow_stalling:
                 self._end(GoalState.SUCCEEDED, why, result)
             else:

@@ -24,7 +24,7 @@ from ibrobot_core.api import (
     ns,
     seconds,
 )
-from ibrobot_core.app import Guard, Spline
+from ibrobot_core.app import Spline
 from ibrobot_planning.executors.options import TrajectoryOptions
 from ibrobot_planning.executors.trajectory_goal import (
     CheckedTrajectory,
@@ -32,6 +32,7 @@ from ibrobot_planning.executors.trajectory_goal import (
     check_positions,
     check_trajectory,
 )
+from ibrobot_planning.guard_label import in_words
 
 LAG_S = 0.1
 """Longest lag of a joint behind its setpoint [s], as in ADR 16."""
@@ -191,11 +192,7 @@ class TrajectoryExecutor(Executor):
         if is_held_back or stop is not None or self._now_ns < running.spline.end_ns:
             beyond = _exceeds(error - LAG_S * np.abs(velocity), running.goal.path_tolerance)
             if is_held_back or beyond.any():
-                why = (
-                    f"the guard: {Guard.read(held_back)['text']}"
-                    if is_held_back
-                    else self._off_path(beyond, error, running)
-                )
+                why = f"the guard: {in_words(held_back)}" if is_held_back else self._off_path(beyond, error, running)
                 return self._stop(GoalState.ABORTED, why, measured, {"exceeded": "path"})
             return setpoint
         beyond = _exceeds(error, running.goal.goal_tolerance)

@@ -1,0 +1,19 @@
+"""What the guard says of a command that it changed."""
+
+from __future__ import annotations
+
+import json
+
+
+def in_words(label: str) -> str:
+    """A label of the guard for people."""
+    read = json.loads(label)
+    if read["distance"] is None:
+        return f"{read['first']}: {read['second']}"
+    return f"{read['first']} was {1000 * read['distance']:.1f} mm from {read['second']}"
+
+
+def touches(label: str) -> bool:
+    """Whether the two things of a label touch one another, as those do that the guard lets press."""
+    distance = json.loads(label)["distance"]
+    return distance is not None and distance <= 0
