@@ -96,6 +96,12 @@ CLAIMS = (
         "`lerobot[dataset]`, or `--lerobot PYTHON`",
     ),
     Claim(
+        "record_convert",
+        "`ibrobot record --convert` loses no message, misses no tick, and gives the bytes of a later conversion",
+        "docs/how-to/record.md",
+        "record_convert.py --episodes 3 --seconds 5 --pause 2",
+    ),
+    Claim(
         "scenes",
         "the scripted policies solve 95 of 100 seeds of each scene; equal seeds give equal bytes",
         "docs/how-to/use-scenes.md",
