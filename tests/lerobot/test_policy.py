@@ -232,8 +232,10 @@ def test_fewer_actions_on_demand(folders: dict[str, Path]) -> None:
 
 
 def test_identity_states_what_computes_and_how(folders: dict[str, Path]) -> None:
-    assert loaded(folders["act"]).identity().endswith(f"torch {version('torch')}, cpu")
-    assert loaded(folders["act"], dtype="bfloat16").identity().endswith(", cpu in bfloat16")
+    cpu = torch.backends.cpu.get_cpu_capability()
+    identity = loaded(folders["act"], threads=1).identity()
+    assert identity.endswith(f"torch {version('torch')}, cpu, {cpu}, threads 1")
+    assert ", cpu in bfloat16, " in loaded(folders["act"], dtype="bfloat16").identity()
 
 
 @pytest.mark.parametrize(("dtype", "is_rounded"), [("auto", True), ("bfloat16", True), ("float32", False)])

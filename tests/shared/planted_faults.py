@@ -122,3 +122,24 @@ JOINTS: dict[str, tuple[dict[str, Any], ...]] = {
 }
 """Likewise, from positions, commands and answers."""
 PLANTED = {**TIMES, **PICTURES, **JOINTS}
+DEMONSTRATED: dict[str, Any] = {
+    "idle_start": {"idle_s": 3.0, "seconds": 9.5},
+    "idle_end": {"seconds": 12.0},
+    "stall": {"stall": (2.5, 3.0), "seconds": 10.0},
+    "jerk": {"shake": 0.05},
+    "saturated": {"seen": lambda state: np.minimum(state, (0.3, 9, 9, 9)), "cut": (0, 0.3)},
+    "picture_black": {"picture": lambda camera, picture, t_s: picture * (not 2 < t_s < 3)},
+    "picture_frozen": {"picture": frozen(3.0)},
+    "picture_dark": {"picture": scaled(0.4)},
+    "picture_gaps": {"blind": (2.0, 3.5)},
+    "gripper_idle": {"shut": True},
+    "arm_not_following": {"gain": {0: 0.4}},
+    "camera_moved": {"moved": {"top": (5, 2, 0.03)}},
+    "unseen_start": {"start": (0, 0.5, 0, 0)},
+    "other_prompt": {"prompt": "wipe the table"},
+    "other_speed": {"speed": 2.6, "seconds": 4.0},
+    "bgr": {"picture": of_top(lambda picture: picture[..., ::-1])},
+    "duplicate": {"seed": 3, "seconds": 6.9},
+    "not_judged": {"outcome": "unknown"},
+}
+"""Likewise, in demonstrations; found in comparison with the other episodes."""

@@ -4,16 +4,29 @@ from __future__ import annotations
 
 import itertools
 import json
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.api import Contract, Frame, IbrobotError, Policy, RecorderError
+from ibrobot_core.api import (
+    Context,
+    Contract,
+    Engine,
+    Frame,
+    IbrobotError,
+    ModelContext,
+    Policy,
+    RealClock,
+    RecorderError,
+    Tensors,
+    Transport,
+)
 from ibrobot_core.app import (
     FrameAssembler,
     RobotConfig,
@@ -22,13 +35,28 @@ from ibrobot_core.app import (
     installed_plugins,
     policy_units,
 )
+from ibrobot_diagnose.cause import Shown
+from ibrobot_diagnose.pictures import reddened
 from ibrobot_diagnose.window import Asked, Floats, Window
 
 ACTION = "action"
-_MOST = 8
-"""Frames on which the model is asked with changed observations."""
+_MOST, _MOST_OF_PARTS = 8, 3
+"""Frames on which the model is asked with changed observations, and with changed parts of a vector."""
+_ADDRESSES = ("url", "address", "server")
+"""Options of policies that name a server of their own."""
+_HERE = "monolithic"
+"""The engine that asks the model in this process."""
+_PATIENCE_NS = 600_000_000_000
 
 type Values = Mapping[str, NDArray[Any]]
+
+
+@runtime_checkable
+class Attentive(Protocol):
+    """A policy that says where it looks."""
+
+    def attention(self, tensors: Tensors) -> Mapping[str, NDArray[np.float32]]:
+        """Weights of each picture, shape (h, w), for the tensors of `preprocess`."""
 
 
 @attrs.frozen(eq=False)
@@ -62,10 +90,17 @@ class Model:
         episode: its recording.
         config: the robot.
         name: the model's name in it.
+        asked_there: ask the servers that the robot's transport connects to, and load no weights here.
     """
 
-    def __init__(self, window: Window, episode: Path, config: RobotConfig, name: str) -> None:
-        self.window, self._episode, self._name = window, episode, name
+    def __init__(
+        self, window: Window, episode: Path, config: RobotConfig, name: str, *, asked_there: bool = False
+    ) -> None:
+        self.window, self._episode, self._name, self._config = window, episode, name, config
+        self._asked_there = asked_there
+        self._engine: Engine | None = None
+        self._transport: Transport | None = None
+        self._requests = itertools.count(1)
         model = config.models[name]
         self.contract = Contract.from_config(config, model.extra_observations)
         self.policy: Policy = build_policy(config, installed_plugins(), name, self._seed)
@@ -85,16 +120,39 @@ class Model:
         return int(self.window.metadata.get("seed", "0"))
 
     def load(self) -> None:
-        """Load the weights.
+        """Load the weights, or find the server.
 
         Raises:
-            PolicyError: if they cannot be loaded.
+            PolicyError: if they cannot be loaded, or no server has the model.
         """
-        self.policy.load()
+        config, registry = self._config, installed_plugins()
+        inference = config.control_modes[self.window.metadata["mode"]].inference
+        if self._asked_there and config.transport is not None:
+            descriptor = registry.find("transport", config.transport.type)
+            context = Context.of(config, "transport", RealClock(), self._seed)
+            self._transport = descriptor.make(config.transport.options, context)
+        kind = inference.type if inference is not None and self._asked_there else _HERE
+        engines = registry.find("engine", kind)
+        options = inference.options if inference is not None and kind == inference.type else engines.options()
+        model = ModelContext(config, self.policy, self._transport)
+        context = Context.of(config, self._name, RealClock(), self._seed, model=model)
+        self._engine = engines.make(options, context)
+        self._engine.start()
         self.policy.reset(self._seed)
+        self._engine.reset(self._seed)
+
+    @property
+    def engine(self) -> Engine:
+        """What runs the model; loaded."""
+        assert self._engine is not None
+        return self._engine
 
     def close(self) -> None:
         """Release the model."""
+        if self._engine is not None:
+            self._engine.close()
+        if self._transport is not None:
+            self._transport.close()
         self.policy.close()
 
     def frames(self, asked: Sequence[Asked]) -> Iterator[Frame]:
@@ -135,10 +193,19 @@ class Model:
             PolicyError: if an observation is missing, or the model fails.
         """
         frame = self._units.frame(attrs.evolve(frame, prompt=prompt))
-        outputs = self.policy.infer(self.policy.preprocess(frame))
+        deadline_ns = time.monotonic_ns() + _PATIENCE_NS
+        outputs = self.engine.infer(self.policy.preprocess(frame), next(self._requests), deadline_ns)
         actions = np.array(self.policy.postprocess(outputs), dtype=np.float64)
         result: Floats = np.asarray(self._units.radians(ACTION, actions), np.float64)
         return result
+
+    def attention(self, frame: Frame) -> Mapping[str, Floats]:
+        """Where the model looks in each picture, camera -> weights, shape (h, w); empty for a model that cannot say."""
+        policy = self.policy
+        if self._asked_there or not isinstance(policy, Attentive) or frame.missing:
+            return {}
+        tensors = policy.preprocess(self._units.frame(attrs.evolve(frame, prompt=self.window.prompt)))
+        return {key: np.asarray(weights, np.float64) for key, weights in policy.attention(tensors).items()}
 
     def again(self) -> Iterator[Again]:
         """Ask every request that was answered again."""
@@ -154,31 +221,65 @@ class Model:
             for each in by_time[frame.stamp_ns]:
                 yield Again(each, frame.missing, self.answer(frame, each.answer.prompt))
 
-    def whose(self, first: Again) -> str:
-        """Why an answer differs, in words."""
-        answer = first.asked.answer
-        here, there = self.policy.weights(), answer.weights
-        if here and there and here != there:
-            return f"the weights are others: {there} acted, {here} was asked"
+    def whose(self, again: Sequence[Again]) -> str:
+        """Why answers differ, in words; empty if all are equal."""
+        differing = [each for each in again if not each.equal]
+        return next(self._reasons(differing, len(again)), "") if differing else ""
+
+    def _reasons(self, differing: Sequence[Again], count: int) -> Iterator[str]:
+        """Whose the difference may be, the surest first."""
+        first = differing[0]
+        answer, stats, at_s = first.asked.answer, self.engine.stats, self.window.since(first.asked.answer.observed_ns)
+        if stats.weights and answer.weights and stats.weights != answer.weights:
+            yield f"the weights are others: {answer.weights} acted, {stats.weights} was asked"
         if self.policy.fingerprint() != self.window.policy.get("fingerprint", self.policy.fingerprint()):
-            return "the checkpoint is another: its configuration or statistics differ from those that acted"
-        place = self.policy.identity()
-        if place and answer.server and place != answer.server:
-            return f"the library or processor is another: {answer.server} acted, {place} was asked"
+            yield "the checkpoint's processors (statistics, features) are others, with the same weights"
+        if changed := self._changed_contract():
+            yield f"the contract is another: {changed} of the robot YAML is not that of the recording"
+        yield from _differences(answer.server, stats.server)
         if first.missing:
-            return f"the recording lacks {', '.join(sorted(first.missing))} at that time"
-        if first.difference < 1e-3:
-            return "rounding: another processor, or another number of threads (`threads` of the model)"
-        return "an observation: the recording has another picture or state than the model was given"
+            yield f"the recording lacks {', '.join(sorted(first.missing))} at {at_s:.2f} s"
+        if len(differing) == count and first.difference < 1e-3:
+            yield "rounding: another processor, or another number of threads (`threads` of the model)"
+        yield (
+            "an observation: model, library and processor are the same, so the recording has another picture or state "
+            f"at {at_s:.2f} s than the model was given"
+        )
+
+    def _changed_contract(self) -> str:
+        """What of the contract differs from the recorded one; empty if nothing does."""
+        recorded, asked = self.window.contract, self.contract
+        if recorded.rate_hz != asked.rate_hz:
+            return "rate_hz"
+        if recorded.action_parts != asked.action_parts:
+            return "action"
+        known = {part.key for part in recorded.observation_parts}
+        keys = [key for key in self.policy.spec.observations if key in known]
+        return next((key for key in keys if recorded.parts(key) != asked.parts(key)), "")
 
 
-def model_of(window: Window, episode: Path, given: str) -> Model:
+def _differences(acted: str, asked: str) -> Iterator[str]:
+    """What differs between the identities of those who computed the answers: a program, a library, or a processor."""
+    one, other = (each.rpartition(": ")[2].split(", ") for each in (acted, asked))
+    if not acted or not asked:
+        return
+    if len(one) != len(other):
+        yield f"the program is another: {acted} acted, {asked} was asked"
+    for here, there in zip(one, other, strict=False):
+        if here != there:
+            same = here.split(" ")[0] == there.split(" ")[0]
+            what = "number of threads" if here.startswith("threads ") else "library" if same else "processor"
+            yield f"the {what} is another: {here} acted, {there} was asked"
+
+
+def model_of(window: Window, episode: Path, given: str, server: str = "") -> Model:
     """The model of a run.
 
     Args:
         window: the run.
         episode: its recording.
         given: path of a checkpoint, or the name of a model in the recorded robot YAML; empty for the one that acted.
+        server: address of the server that computes its answers; empty to load its weights here.
 
     Raises:
         RecorderError: if the recording does not say which model acted, or has no such model.
@@ -198,7 +299,19 @@ def model_of(window: Window, episode: Path, given: str) -> Model:
     if path is not None:
         models[name] = {**models[name], "path": str(path.absolute())}
         document["models"] = models
-    return Model(window, episode, _config(window, document), name)
+    if not server:
+        return Model(window, episode, _config(window, document), name)
+    known = attrs.fields_dict(installed_plugins().find("policy", models[name]["type"]).options)
+    if own := next((each for each in _ADDRESSES if each in known), None):
+        document["models"] = {**models, name: {**models[name], own: server}}
+    elif document.get("transport"):
+        document["transport"] = {**document["transport"], "connect": [server], "listen": []}
+    else:
+        raise RecorderError(
+            f"{episode}: its model {name!r} was not computed by a server: its robot YAML names no transport; ask it "
+            "without --server"
+        )
+    return Model(window, episode, _config(window, document), name, asked_there=own is None)
 
 
 def _config(window: Window, document: Mapping[str, Any]) -> RobotConfig:
@@ -235,24 +348,24 @@ def effects(model: Model) -> list[Effect]:
     """How far the model's answers move if its observations are changed, largest first."""
     asked = [each for each in model.window.asked if len(each.chunk)]
     chosen = [asked[i] for i in np.unique(np.linspace(0, len(asked) - 1, min(_MOST, len(asked))).round().astype(int))]
-    frames = list(model.frames(chosen))
-    frames = [each for each in frames if not each.missing]
+    frames = [each for each in model.frames(chosen) if not each.missing]
     if not frames:
         return []
     prompt = model.window.prompt
     plain = [model.answer(frame, prompt) for frame in frames]
-    joints = model.contract.action_names
+    few = range(0, len(frames), max(1, len(frames) // _MOST_OF_PARTS))
+    changes = [(range(len(frames)), each) for each in _changes(model, frames)]
+    changes += [(few, each) for each in _changes_of_parts(model, frames)]
     listed = []
-    for what, how, change in _changes(model, frames):
+    for numbers, (what, how, change) in changes:
         try:
             moved = [
-                np.abs(model.answer(_changed(frame, i, change), prompt) - plain[i]).mean(axis=0)
-                for i, frame in enumerate(frames)
+                np.abs(model.answer(_changed(frames[i], i, change), prompt) - plain[i]).mean(axis=0) for i in numbers
             ]
         except IbrobotError:  # some models refuse what cannot be
             continue
         means = np.mean(moved, axis=0)
-        listed.append(Effect(what, how, dict(zip(joints, map(float, means), strict=False))))
+        listed.append(Effect(what, how, dict(zip(model.contract.action_names, map(float, means), strict=False))))
     return sorted(listed, key=lambda each: -each.largest)
 
 
@@ -266,6 +379,8 @@ class Examined:
     """Why the first answer that differs does; empty if all are equal."""
     identity: str
     """Library and device that computed the answers."""
+    looks: tuple[Shown, ...] = ()
+    """Pictures with what the model attends to in red, if it can say."""
 
 
 def examine(model: Model) -> Examined:
@@ -276,9 +391,18 @@ def examine(model: Model) -> Examined:
     """
     with loaded(model):
         again = tuple(model.again())
-        first = next((each for each in again if not each.equal), None)
-        whose = model.whose(first) if first is not None else ""
-        return Examined(again, tuple(effects(model)), whose, model.policy.identity())
+        changed, looks = effects(model), tuple(looks_of(model))
+        return Examined(again, tuple(changed), model.whose(again), model.engine.stats.server, looks)
+
+
+def looks_of(model: Model) -> Iterator[Shown]:
+    """Pictures of the first, the middle and the last request, with what the model attends to in red."""
+    asked = [each for each in model.window.asked if len(each.chunk)]
+    for frame in model.frames([asked[i] for i in sorted({0, len(asked) // 2, len(asked) - 1})]) if asked else ():
+        for key, weights in model.attention(frame).items():
+            share, at_s = 100 * float(weights.sum()), model.window.since(frame.stamp_ns)
+            title = f"{key.rpartition('.')[2]} at {at_s:.1f} s: {share:.0f} % of what the model attends to"
+            yield Shown(title, reddened(frame.values[key], weights))
 
 
 type _Change = Callable[[int, Values], Values]
@@ -307,10 +431,13 @@ _OF_PICTURES: Mapping[str, Callable[[int, NDArray[Any]], NDArray[Any]]] = {
     "black": lambda i, value: np.zeros_like(value),
     "BGR for RGB": lambda i, value: np.ascontiguousarray(value[..., ::-1]),
     "upside down": lambda i, value: np.ascontiguousarray(value[::-1, ::-1]),
+    "mirrored": lambda i, value: np.ascontiguousarray(value[:, ::-1]),
     "shifted by a tenth": lambda i, value: np.roll(value, value.shape[1] // 10, axis=1),
 }
 _OF_VECTORS: Mapping[str, Callable[[int, NDArray[Any]], NDArray[Any]]] = {
+    "replaced by zeros": lambda i, value: np.zeros_like(value),
     "in degrees": lambda i, value: value * np.float32(180 / np.pi),
+    "from -100 to 100": lambda i, value: value * np.float32(100 / np.pi),
     "in reverse order": lambda i, value: value[::-1].copy(),
     "shifted by 0.2 rad": lambda i, value: value + np.float32(0.2),
 }
@@ -333,3 +460,31 @@ def _changes(model: Model, frames: Sequence[Frame]) -> Iterator[tuple[str, str, 
     for one, other in itertools.combinations(cameras, 2):
         if frames[0].values[one].shape == frames[0].values[other].shape:
             yield f"{one.rpartition('.')[2]} and {other.rpartition('.')[2]}", "exchanged", _exchanged(one, other)
+
+
+def _changes_of_parts(model: Model, frames: Sequence[Frame]) -> Iterator[tuple[str, str, _Change]]:
+    """As `_changes`, of each element of the vectors alone."""
+    for key, shape in model.policy.spec.observations.items():
+        if len(shape) != 1:
+            continue
+        names = [name for part in model.contract.parts(key) for name in part.feature.names or ()]
+        shown = [frame.values[key] for frame in frames]
+        half, mean = len(shown) // 2, np.mean(shown, axis=0)
+        for j, name in enumerate(names if len(names) == shape[0] else ()):
+            by: dict[str, Sequence[float]] = {
+                "of another time": [float(each[j]) for each in (*shown[half:], *shown[:half])],
+                "replaced by its mean": [float(mean[j])], "replaced by zero": [0.0],
+                "shifted by 0.2 rad": [float(each[j]) + 0.2 for each in shown],
+            }  # fmt: skip
+            for how, values in by.items():
+                if half or how != "of another time":
+                    yield f"{key.rpartition('.')[2]} {name.removesuffix('.pos')}", how, _one(key, _element(j, values))
+
+
+def _element(j: int, values: Sequence[float]) -> Callable[[int, NDArray[Any]], NDArray[Any]]:
+    def change(i: int, value: NDArray[Any]) -> NDArray[Any]:
+        changed = value.copy()
+        changed[j] = values[i % len(values)]
+        return changed
+
+    return change

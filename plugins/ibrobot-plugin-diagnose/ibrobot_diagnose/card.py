@@ -55,7 +55,7 @@ class CameraCard:
     usual_shift: float
     """How far the backgrounds of its episodes are apart [pixels of 640]."""
     repeated_s: float
-    """Longest time with equal pictures while the arm moved [s]."""
+    """Longest time with equal pictures while the arm moved, in nearly all episodes [s]."""
 
     @cached_property
     def vectors(self) -> NDArray[np.float32]:
@@ -510,7 +510,8 @@ class _CameraMaker:
             self.topic, self.size,
             {n: tuple(np.quantile(np.concatenate(each), LEVELS).tolist()) for n, each in self._numbers.items()},
             thumbnails, tuple(self._places[i] for i in chosen), np.concatenate(self._poses)[chosen], usual,
-            _coloured(middle), _coloured(moving), float(np.quantile(shifts, 0.9)), max(self._repeated),
+            _coloured(middle), _coloured(moving), float(np.quantile(shifts, 0.9)),
+            float(np.quantile(self._repeated, 0.95)),
         )  # fmt: skip
 
 

@@ -8,13 +8,14 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, ClassVar, override
 
 import attrs
-import numpy as np
-from numpy.typing import NDArray
 
 from ibrobot_core.api import Descriptor, IbrobotError
 from ibrobot_core.app import installed_plugins
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from ibrobot_diagnose.ask_again import Examined
     from ibrobot_diagnose.card import Card
     from ibrobot_diagnose.window import Window
@@ -50,6 +51,10 @@ class Evidence:
     """From when on [s], since the beginning of the window; None if it applies throughout."""
     details: tuple[str, ...] = ()
     """Further evidence, a line each."""
+    explains: frozenset[str] | None = None
+    """In place of those of the cause, if they depend on what was found."""
+    follows: frozenset[str] = frozenset()
+    """Names of further causes that bring this about."""
     pictures: tuple[Shown, ...] = ()
 
 
@@ -144,6 +149,11 @@ class Finding:
     def name(self) -> str:
         """Name of the cause."""
         return self.cause.name
+
+    def explains(self, other: Finding) -> bool:
+        """Whether it brings the other one about."""
+        known = self.cause.explains if self.evidence.explains is None else self.evidence.explains
+        return other.name in known or self.name in other.evidence.follows
 
 
 @attrs.frozen(eq=False)
@@ -243,16 +253,16 @@ def diagnose(
 
 def ranked(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     """Findings by likelihood, each after those that explain it; what explains another is at least as likely."""
-    own = {each.name: each.evidence.likelihood for each in findings}
     likely = {
-        each.name: max(own[name] for name in {each.name, *(each.cause.explains & own.keys())}) for each in findings
+        each.name: max(other.evidence.likelihood for other in findings if other is each or each.explains(other))
+        for each in findings
     }
     rest = sorted(findings, key=lambda each: (-likely[each.name], each.name))
     ordered: list[Finding] = []
     while rest:
-        free = [each for each in rest if not any(each.name in other.cause.explains for other in rest)]
+        free = [each for each in rest if not any(other.explains(each) for other in rest if other is not each)]
         # Two that explain each other: the one that explains more.
-        chosen = free[0] if free else max(rest, key=lambda each: len(each.cause.explains & own.keys()))
+        chosen = free[0] if free else max(rest, key=lambda each: sum(map(each.explains, rest)))
         ordered.append(chosen)
         rest.remove(chosen)
     return tuple(ordered)

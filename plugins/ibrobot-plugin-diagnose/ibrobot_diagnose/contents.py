@@ -156,6 +156,8 @@ def _image(picture: Any, title: str, hidden: bool = False) -> str:
 def _pictures(explanation: Explanation) -> str:
     """The pictures of the findings, side by side."""
     shown = [each for finding in explanation.diagnosis.findings for each in finding.evidence.pictures]
+    if explanation.reference.model is not None:
+        shown += explanation.reference.model.looks
     shown = list({each.title: each for each in shown}.values())
     if not shown:
         return ""

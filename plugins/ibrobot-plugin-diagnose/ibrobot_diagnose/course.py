@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any
@@ -163,6 +164,22 @@ def conflict_of(course: Course) -> Floats:
         nearest[part] = np.where(known, np.minimum(nearest[part], far), nearest[part])
         count[part] += known
     return np.where(count > 1, nearest, 0.0)
+
+
+def changes_of(window: Window) -> float:
+    """How a change from answer to answer, for the same times, agrees with the next one: -1 to and fro, 1 alike."""
+    used = [each for each in window.asked if each.used and each.answer.joint_names == window.joints]
+    changes = []
+    for one, other in itertools.pairwise(used):
+        times = other.times_ns[other.times_ns <= one.times_ns[-1]]
+        if len(times) > 1:
+            moved = _at(other.times_ns, other.chunk, times, 1) - _at(one.times_ns, one.chunk, times, 1)
+            changes.append(np.nanmedian(moved, axis=0))
+    if len(changes) < 4:
+        return -1.0
+    rows = np.nan_to_num(np.array(changes))
+    size = float((rows**2).sum(axis=1).mean())
+    return float((rows[1:] * rows[:-1]).sum(axis=1).mean()) / size if size > 0 else 0.0
 
 
 def _at(own_ns: Times, values: Floats, t_ns: Times, step_ns: int) -> Floats:

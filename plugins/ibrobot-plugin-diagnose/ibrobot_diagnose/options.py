@@ -40,6 +40,10 @@ class ExplainOptions:
         None, label="Model", names="policy",
         help="ask the model again: its checkpoint's folder, or its name in the recorded YAML; `.`: the one that acted",
     )  # fmt: skip
+    server: str | None = option(
+        None, label="Server", more=True,
+        help="with --model, ask the server at this address, which has the weights, e.g. tcp/gpu.lab:7447",
+    )  # fmt: skip
     out: Path | None = option(
         None, label="Folder", suggest="explanations/{episodes}", help="folder for a report as HTML and JSON"
     )

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections import Counter
 from typing import Any
 
 import attrs
+import numpy as np
 import pytest
 from ibrobot_diagnose.card import make_card
 from ibrobot_diagnose.cause import KIND, Cause, CauseDescriptor, Evidence, Reference, diagnose, installed_causes
@@ -113,3 +116,36 @@ def test_other_packages_add_causes(monkeypatch):
     monkeypatch.setattr(Squeaks, "name", "plan_dry")
     with pytest.raises(IbrobotError, match="there is a cause 'plan_dry' already"):
         installed_causes()
+
+
+def test_listing_plugins_imports_no_numpy():
+    """Every `ibrobot` command imports the hooks."""
+    code = "import sys, ibrobot_diagnose; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_answers_that_all_come_too_late_are_named():
+    """None of them is used."""
+    late = diagnose(window_of(Run(seed=9310, cameras=(), latency_s=2.0, outcome="failure")), Reference())
+    assert late.first == "answers_slow"
+
+
+def test_slow_arm_is_explained_by_what_makes_it_slow(data):
+    held = diagnose(window_of(Run(seed=9311, velocity=0.08, outcome="failure", **NONE)), data)
+    assert {"limits_low", "other_speed"} <= {each.name for each in held.findings}
+    assert held.first == "limits_low"
+
+
+def test_fast_answers_are_named_though_the_arm_is_not_faster(data):
+    def twice(chunk):
+        return chunk[np.minimum(2 * np.arange(len(chunk)), len(chunk) - 1)]
+
+    fast = diagnose(window_of(Run(seed=9312, velocity=0.8, answered=twice, outcome="failure", **NONE)), data)
+    assert fast.first == "other_speed"
+    assert "answers move the arm too fast" in fast.findings[0].evidence.text
+
+
+def test_answers_that_begin_elsewhere_are_no_other_statistics(data):
+    """They are inside of what the data shows."""
+    shifted = Run(seed=9313, answered=lambda chunk: np.add(chunk, (0.2, 0, 0, 0)), outcome="failure", **NONE)
+    assert "statistics" not in {each.name for each in diagnose(window_of(shifted), data).findings}

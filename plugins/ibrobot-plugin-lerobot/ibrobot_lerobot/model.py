@@ -69,9 +69,11 @@ class PolicyModel:
         self._one_by_one = False
         """Whether random draws cannot be assigned to requests."""
         self._log = log
-        self.place = f"{self._device}" if options.dtype == "auto" else f"{self._device} in {options.dtype}"
-        """Device, and the precision if it was chosen."""
-        log.info("%s on %s, %d threads", checkpoint.type, self.place, threads)
+        self.place = place = f"{self._device}" if options.dtype == "auto" else f"{self._device} in {options.dtype}"
+        """Device, the precision if it was chosen, and what else a CPU's rounding depends on."""
+        if self._device.type == "cpu":
+            self.place += f", {torch.backends.cpu.get_cpu_capability()}, threads {threads}"
+        log.info("%s on %s, %d threads", checkpoint.type, place, threads)
 
     def warm_up(self, tensors: Tensors) -> NDArray[np.float32]:
         """Run the network once and check that it returns an action chunk, shape (1, N, A), which is returned.
@@ -126,6 +128,38 @@ class PolicyModel:
             self._draws = draws.made
         result = actions.float().numpy(force=True)
         return [np.array(result[i : i + 1]) for i in range(len(batch))]
+
+    def attention(self, tensors: Tensors) -> dict[str, NDArray[np.float32]]:
+        """Where the last decoder layer of an ACT looks, over the chunk: camera -> weights, shape (h, w).
+
+        All it looks at sums up to 1, the state included. Empty for other networks.
+        """
+        network = getattr(self.network, "model", None)
+        cameras = list(self.network.config.image_features or {})
+        if self._checkpoint.type != "act" or network is None or not cameras or self._chunk is not None:
+            return {}
+        weights: list[torch.Tensor] = []
+        sizes: list[tuple[int, int]] = []
+        hooks = (
+            network.decoder.layers[-1].multihead_attn.register_forward_hook(
+                lambda module, given, output: weights.append(output[1])
+            ),
+            network.encoder_img_feat_input_proj.register_forward_hook(
+                lambda module, given, output: sizes.append((output.shape[-2], output.shape[-1]))
+            ),
+        )
+        try:
+            self.predict([tensors])
+        finally:
+            for hook in hooks:
+                hook.remove()
+        looks = weights[0][0].float().mean(dim=0).numpy(force=True)
+        at = len(looks) - sum(height * width for height, width in sizes)
+        shown: dict[str, NDArray[np.float32]] = {}
+        for camera, (height, width) in zip(cameras, sizes, strict=True):
+            shown[camera] = looks[at : at + height * width].reshape(height, width)
+            at += height * width
+        return shown
 
     def inputs(self, batch: Sequence[Tensors]) -> dict[str, Any]:
         """The network's inputs: the requests' tensors on its device, with normalised images."""

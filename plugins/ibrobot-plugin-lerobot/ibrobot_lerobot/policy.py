@@ -172,6 +172,10 @@ class LeRobotPolicy(Policy):
             self._check(tensors)
         return [{ACTION: action} for action in self._model.predict(batch)]
 
+    def attention(self, tensors: Tensors) -> Mapping[str, NDArray[np.float32]]:
+        """Where the network looks in each picture for a request's tensors, see `PolicyModel.attention`."""
+        return self._model.attention(tensors) if self._model is not None else {}
+
     @override
     def postprocess(self, tensors: Tensors) -> NDArray[np.float64]:
         action = np.asarray(tensors[ACTION])

@@ -133,11 +133,28 @@ class JointOrder(CardCause):
         order = _assignment(costs)
         plain, best = float(costs.diagonal().sum()), float(costs[np.arange(size), order].sum())
         ratio = (plain + 0.1) / (best + 0.1 * size**0.5)
+        matches = np.abs(_known(window)[0] - np.median(card.starts, axis=0)).max() < 0.1
+        ratio *= (0.7 if matches else 1.0) * (0.7 if (order != np.arange(size)).sum() > 2 else 1.0)
+        if (pair := _exchanged(_known(window)[0], np.median(card.starts, axis=0))) is not None:
+            order, ratio = np.arange(size), max(ratio, 4.0)
+            order[list(pair)] = order[list(pair[::-1])]
         pairs_of = [f"{window.joints[i]} behaves as {card.joints[j]}" for i, j in enumerate(order) if i != j]
         if not pairs_of or len(pairs_of) < 2:
             return None
         text = f"Joints are exchanged: {', '.join(pairs_of)} in the data; so they fit {ratio:.1f} times as well."
         return Evidence(text, ratio, "times", 1.8, likelihood(ratio, 1.8, 3.0))
+
+
+def _exchanged(start: Floats, usual: Floats) -> tuple[int, int] | None:
+    """The two joints with which a start that is far from the usual one is exactly that."""
+    if np.abs(start - usual).max() < 0.5:
+        return None
+    for a, b in itertools.combinations(range(len(start)), 2):
+        swapped = start.copy()
+        swapped[[a, b]] = swapped[[b, a]]
+        if np.abs(swapped - usual).max() < 0.1:
+            return a, b
+    return None
 
 
 def _assignment(costs: NDArray[np.float64]) -> NDArray[np.intp]:
@@ -223,6 +240,9 @@ class GripperScaled(CardCause):
         factor = (end - begin) / max(high - low, 0.05)
         # Only a range that is too large is sure: a gripper that never opens is one of a policy that does not act.
         reach = max(factor, abs(end) / max(abs(high), 0.05)) if factor > 1 else 1.0
+        start = float(np.median(card.starts[:, j]))
+        if abs(own[0] - start) > 0.4 * max(high - low, 0.05) and abs(own[0] - reach * start) > 0.3 * reach * abs(start):
+            reach = 1.0  # it begins where no factor brings it
         text = f"The gripper reaches from {begin:.2f} to {end:.2f}; in the data from {low:.2f} to {high:.2f} rad."
         return Evidence(text, reach, "times", 1.5, likelihood(reach, 1.5, 2.2))
 
@@ -242,7 +262,7 @@ class GripperReversed(CardCause):
         if j is None or not _same(window, card):
             return None
         own = _known(window)[:, j : j + 1]
-        mirrored = card.row(card.state, 0.0)[j] + card.row(card.state, 1.0)[j] - own
+        mirrored = own[0, 0] + float(np.median(card.starts[:, j])) - own
         levels = card.state[_MIDDLE, j]
         span = float(_span(card)[j])
         costs = [
@@ -251,7 +271,7 @@ class GripperReversed(CardCause):
         start = float(np.median(card.starts[:, j]))
         first = [abs(float(each[0, 0]) - start) / span for each in (own, mirrored)]
         plain, other = (cost + begin for cost, begin in zip(costs, first, strict=True))
-        ratio = (plain + 0.08) / (other + 0.08) if plain > 0.35 else 0.5
+        ratio = (plain + 0.08) / (other + 0.08) if plain > 0.35 and first[0] > 0.25 else 0.5
         text = (
             f"The gripper is reversed: it begins at {own[0, 0]:.2f} rad where the data begins at {start:.2f}, and the "
             f"mirror image of its way is {ratio:.1f} times as close to the data."

@@ -8,9 +8,10 @@ from typing import override
 import numpy as np
 
 from ibrobot_core.api import NS_PER_S
+from ibrobot_diagnose.card import Card
 from ibrobot_diagnose.cause import Cause, Evidence, Reference, likelihood
 from ibrobot_diagnose.course import course_of, operated_share
-from ibrobot_diagnose.window import Window
+from ibrobot_diagnose.window import Limits, Window
 
 
 class LimitsLow(Cause):
@@ -18,6 +19,7 @@ class LimitsLow(Cause):
 
     name = "limits_low"
     title = "limits leave the model's actions as they are"
+    explains = frozenset({"smoothing_averages"})
     needs = frozenset({"chunks", "commands", "state"})
     remedy = (
         "Raise the limit of this joint in the robot YAML (`robot: {joints: …}`) to what the arm and its surroundings "
@@ -47,7 +49,19 @@ class LimitsLow(Cause):
             f"run, by up to {furthest:.2f} rad from what the model said."
         )
         since = window.since(int(course.times_ns[touched.any(axis=1).argmax()]))
-        return Evidence(text, 100 * share, "%", 8.0, likelihood(share * min(1.0, furthest / 0.05), 0.08, 0.3), since)
+        likely = likelihood(share * min(1.0, furthest / 0.05), 0.08, 0.3)
+        if reference.card is not None and reference.card.joints == window.joints:
+            likely = min(likely, _needed(kind, joint, limits, reference.card))
+        return Evidence(text, 100 * share, "%", 8.0, likely, since)
+
+
+def _needed(kind: str, joint: int, limits: Limits, card: Card) -> float:
+    """Likelihood that demonstrations exceed a limit; one that they keep is not too low: the model asks for more."""
+    if kind == "velocity":
+        usual = float(card.row(card.speed, 0.99)[joint])
+        return likelihood(usual / max(limits.velocity, 1e-6), 1.0, 1.3)
+    low, high = float(card.row(card.action, 0.01)[joint]), float(card.row(card.action, 0.99)[joint])
+    return likelihood(max(high - limits.upper, limits.lower - low, 0.0), 0.03, 0.1)
 
 
 class GuardHeld(Cause):

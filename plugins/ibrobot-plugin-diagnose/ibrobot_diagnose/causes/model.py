@@ -65,8 +65,10 @@ class CameraIgnored(ModelCause):
             return None
         name = min(of_cameras, key=lambda each: max(of_cameras[each]))
         moved = max(of_cameras[name])
+        every = len(of_cameras) > 1 and all(max(each) < 0.01 for each in of_cameras.values())
+        ignored = "its pictures, of all cameras" if every else f"the camera {name}"
         text = (
-            f"The policy ignores the camera {name}: without its picture, or with another one, its answers move by "
+            f"The policy ignores {ignored}: without its picture, or with another one, its answers move by "
             f"{moved:.4f} rad; other changes move them by up to {largest:.2f} rad."
         )
         return Evidence(text, moved, "rad", 0.01, likelihood(moved, 0.01, 0.002))

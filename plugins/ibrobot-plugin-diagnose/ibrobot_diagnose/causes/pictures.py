@@ -177,7 +177,7 @@ class _Level(PictureCause):
     @override
     def measure(self, pair: Pair) -> tuple[float, str] | None:
         value = float(np.median(numbers_of(pair.camera)[self.number]))
-        low, high = (pair.card.at(self.number, level) for level in (0.01, 0.99))
+        low, high = (pair.card.at(self.number, level) for level in (0.05, 0.95))
         usual = high if self.above else low
         ratio = (value + 1e-3) / (usual + 1e-3) if self.above else (usual + 1e-3) / (value + 1e-3)
         text = (

@@ -68,8 +68,8 @@ class AnswersSlow(Cause):
 
     name = "answers_slow"
     title = "the model answers in time"
-    needs = frozenset({"chunks"})
-    explains = frozenset({"plan_dry"})
+    needs = frozenset({"answers"})
+    explains = frozenset({"plan_dry", "stands_still"})
     remedy = (
         "Make the model faster (a GPU, fewer denoising steps, `ibrobot export --to onnx`, smaller pictures), or let it "
         "answer with longer chunks; `dispatch: {watermark: auto}` asks early enough if the plan is long enough."
@@ -78,6 +78,8 @@ class AnswersSlow(Cause):
     @override
     def test(self, window: Window, reference: Reference) -> Evidence | None:
         used = [each for each in window.asked if len(each.chunk) and each.answer.outcome in ("used", "late")]
+        if not used:
+            return None
         shares = np.array([_past_share(each) for each in used])
         latencies = np.array([each.answer.latency_ms for each in used])
         share, latency = float(np.median(shares)), float(np.median(latencies))

@@ -32,6 +32,8 @@ class Explain(ExplainOptions):
         episodes = find_episodes(self.episodes)
         if self.data is not None and self.against is not None:
             raise RequestError("--data and --against exclude each other: a run is compared with one of them")
+        if self.server is not None and self.model is None:
+            raise RequestError("--server needs --model: `--model .` is the one that acted")
         data = self.data or self.against
         card = card_of(data) if data is not None else None
         results: dict[Path, dict[str, Any]] = {}
@@ -95,7 +97,9 @@ def explain_episode(
     if options.model is not None:
         from ibrobot_diagnose.ask_again import examine, model_of
 
-        examined = examine(model_of(window, episode, "" if options.model == "." else options.model))
+        examined = examine(
+            model_of(window, episode, "" if options.model == "." else options.model, options.server or "")
+        )
     reference = Reference(card, examined)
     explanation = Explanation.of(window, reference, diagnose(window, reference, tested=lambda name: progress(1)))
     if options.out is not None:
