@@ -194,6 +194,19 @@ CLAIMS = (
         "moving_fleet.py --faults",
     ),
     Claim(
+        "explain",
+        "`ibrobot explain` names a fault that is planted in a simulated run first, and accuses nobody in healthy ones",
+        "docs/how-to/explain-a-failure.md",
+        "explain.py",
+        "`lerobot[dataset,diffusion,training]`",
+    ),
+    Claim(
+        "datasets_check",
+        "`ibrobot datasets check` lists demonstrations with a planted fault, and seldom a good one",
+        "docs/how-to/explain-a-failure.md",
+        "datasets_check.py",
+    ),
+    Claim(
         "server_kill",
         "the arm holds while its server is dead, and continues within 1 s of the restart",
         "docs/how-to/serve.md",

@@ -218,12 +218,13 @@ def with_document(model: Any, **changes: Any) -> Any:
 def test_another_contract_is_named(recorded: Any) -> None:
     episode, _ = recorded("act", "monolithic")
 
-    def smooth(model: Any) -> Any:
+    def exchanged(model: Any) -> Any:
         contract = json.loads(json.dumps(model.window.document["contract"]))
-        contract["rate_hz"] = 25
+        one, other = (each for each in contract["observations"] if each["key"] in (TOP, "observation.images.wrist"))
+        one["peripheral"], other["peripheral"] = other["peripheral"], one["peripheral"]
         return with_document(model, contract=contract)
 
-    assert whose(episode, smooth).startswith("the contract is another: rate_hz")
+    assert whose(episode, exchanged).startswith("the contract is another: observation.images.")
 
 
 def test_another_number_of_threads_is_named(recorded: Any) -> None:

@@ -93,6 +93,8 @@ class Cause(ABC):
     `pictures`, `guard`, `outcome`, `demonstration`; `card`, `card pictures`, `training card`; `model`."""
     explains: ClassVar[frozenset[str]] = frozenset()
     """Names of causes that this one brings about: those are consequences if this one is found."""
+    weak: ClassVar[bool] = False
+    """Whether it speaks of a policy that errs, and not of the set-up: more or better data is what helps."""
     remedy: ClassVar[str]
     """What to do, in the imperative."""
 

@@ -33,7 +33,9 @@ class Explanation:
         """The first line: the most probable cause, or that none was found, and why."""
         diagnosis = self.diagnosis
         if diagnosis.findings:
-            return diagnosis.findings[0].evidence.text
+            first = diagnosis.findings[0]
+            weak = "Nothing is wrong with the set-up; more or better data is what helps: " if first.cause.weak else ""
+            return weak + first.evidence.text
         tested, outcome = len(diagnosis.healthy), self.window.outcome
         lacking = sum("--data" in why for _, why in diagnosis.untested)
         if outcome == "success":

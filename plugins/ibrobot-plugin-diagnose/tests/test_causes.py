@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from ibrobot_diagnose.card import make_card
 from ibrobot_diagnose.cause import KIND, Cause, CauseDescriptor, Evidence, Reference, diagnose, installed_causes
+from ibrobot_diagnose.causes.data import UnseenStates
+from ibrobot_diagnose.report import Explanation
 from made_runs import Run, window_of
-from planted_faults import JOINTS, PICTURES, TIMES
+from planted_faults import JOINTS, PICTURES, TIMES, of_top
 
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import Registry
@@ -149,3 +151,24 @@ def test_answers_that_begin_elsewhere_are_no_other_statistics(data):
     """They are inside of what the data shows."""
     shifted = Run(seed=9313, answered=lambda chunk: np.add(chunk, (0.2, 0, 0, 0)), outcome="failure", **NONE)
     assert "statistics" not in {each.name for each in diagnose(window_of(shifted), data).findings}
+
+
+def test_arm_that_leaves_the_data_for_no_other_reason_is_a_weak_policy(data):
+    """The set-up is not blamed for it."""
+    away = window_of(Run(seed=9314, amplitude=1.4, outcome="failure", **NONE))
+    explained = Explanation.of(away, data, diagnose(away, data, [UnseenStates()]))
+    assert explained.first.startswith("Nothing is wrong with the set-up; more or better data is what helps: ")
+    assert "left the range of the data" in explained.first
+
+
+def test_bright_scene_that_turns_white_is_named(data):
+    """Its brightness can hardly grow."""
+    whole = Run(seed=9315, **ONE, acts=False, picture=of_top(lambda picture: 175 + picture // 4))
+    bright = Reference(
+        make_card([window_of(attrs.evolve(whole, seed=9316 + each), f"demo_{each}") for each in range(3)])
+    )
+    white = attrs.evolve(
+        whole, acts=True, outcome="failure", picture=of_top(lambda picture: np.full_like(picture, 254))
+    )
+    findings = {each.name for each in diagnose(window_of(white), bright).findings}
+    assert "picture_bright" in findings

@@ -72,6 +72,7 @@ class UnseenStates(CardCause):
 
     name = "unseen_states"
     title = "the arm stays where the data was"
+    weak = True
     needs = frozenset({"state", "card"})
     remedy = (
         "See what led the arm there, at the time that is given. If nothing else is wrong, record episodes that begin "

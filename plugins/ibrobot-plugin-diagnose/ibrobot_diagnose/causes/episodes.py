@@ -160,6 +160,7 @@ class GripperIdle(CardCause):
 
     name, title = "gripper_idle", "the gripper acts"
     needs = _SHOWN | {"card"}
+    explains = frozenset({"joint_zero"})
     remedy = "Drop the episode if the task needs the gripper; look at its motor, and at the leader's handle."
 
     @override

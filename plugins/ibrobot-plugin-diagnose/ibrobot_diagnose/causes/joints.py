@@ -47,6 +47,8 @@ def nearest_poses(window: Window, card: Card) -> tuple[Floats, Floats]:
     """Positions of the joints in the window, and those of the data at pictures that look the same; shape (N, J)."""
     own, theirs = [], []
     for pair in pairs(window, card):
+        if pair.card.usual_distance > 0.6:  # its pictures hardly repeat, so that they say nothing of the pose
+            continue
         times = np.array(pair.camera.times_ns, np.int64)
         index = np.unique(np.linspace(0, len(times) - 1, min(120, len(times))).round().astype(int))
         distance, near = nearest(descriptors(pair.camera.small[index]), pair.card.vectors)
@@ -209,6 +211,8 @@ class JointZero(CardCause):
             for joint, off, width in zip(window.joints, middle.tolist(), spread.tolist(), strict=True)
         )
         number = float(sure[j]) * (1.0 if not len(others) or others.max() < 0.7 * sure[j] else 0.7)
+        if spread[j] > 0.6 * abs(middle[j]):
+            number *= 0.5
         start = float(_known(window)[0, j] - np.median(card.starts[:, j]))
         if abs(start - middle[j]) < 0.5 * abs(middle[j]):  # an arm that begins in its rest pose is off by as much
             number *= 1.5

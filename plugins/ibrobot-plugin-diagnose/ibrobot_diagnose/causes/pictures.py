@@ -180,6 +180,9 @@ class _Level(PictureCause):
         low, high = (pair.card.at(self.number, level) for level in (0.05, 0.95))
         usual = high if self.above else low
         ratio = (value + 1e-3) / (usual + 1e-3) if self.above else (usual + 1e-3) / (value + 1e-3)
+        if self.number == "brightness" and self.above:  # a bright scene cannot become much brighter: it turns white
+            white = float(np.median(numbers_of(pair.camera)["clipped"])) - pair.card.at("clipped", 0.95)
+            ratio = max(ratio, 1.0 + white)
         text = (
             f"The pictures of {pair.camera.name} are too {self.words}: their {self.number} is {value:.3g}; in the data "
             f"it is {low:.3g} to {high:.3g}."
@@ -234,13 +237,19 @@ class PictureCovered(PictureCause):
             return None
         lost = rich & (own < 0.3 * known)
         share = 100 * float(lost[rich].mean())
-        rest = np.repeat(np.repeat(rich & ~lost, 4, axis=0), 4, axis=1)
-        other = share < 80 and rest.any() and np.corrcoef(middles[0][rest], middles[1][rest])[0, 1] < 0.5
+        rest, gone = (np.repeat(np.repeat(each, 4, axis=0), 4, axis=1) for each in (rich & ~lost, lost))
+        if gone.any() and middles[0][gone].std() > 4.0 and _agree(middles[0][gone], middles[1][gone]) > 0.6:
+            return 0.0, ""  # out of focus: what is large is still there
+        other = share < 80 and rest.any() and _agree(middles[0][rest], middles[1][rest]) < 0.5
         shift = shift_between(pair) if share > 10 else None
         if other or (shift is not None and shift.after > 0.45 and shift.after > shift.before + 0.1):
             return 0.0, ""  # another view, not this one with something before it
         text = f"Something covers {share:.0f} % of the picture of {pair.camera.name}: there is nothing to see there."
         return share, text
+
+
+def _agree(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
+    return float(np.corrcoef(one, other)[0, 1])
 
 
 def _texture(middle: NDArray[np.floating]) -> NDArray[np.float32]:
