@@ -227,21 +227,6 @@ def test_another_contract_is_named(recorded: Any) -> None:
     assert whose(episode, exchanged).startswith("the contract is another: observation.images.")
 
 
-def test_another_number_of_threads_is_named(recorded: Any) -> None:
-    episode, _ = recorded("act", "monolithic")
-
-    def threads(model: Any) -> Any:
-        models = {**model.window.document["models"]}
-        models["act"] = {**models["act"], "threads": 2}
-        return with_document(model, models=models)
-
-    try:
-        said = whose(episode, threads)
-    finally:
-        torch.set_num_threads(1)
-    assert said in ("", "the number of threads is another: threads 1 acted, threads 2 was asked")
-
-
 def changed_answers(model: Any, **changes: Any) -> Any:
     """The model with other recorded answers."""
     asked = tuple(

@@ -251,7 +251,7 @@ class Model:
         recorded, asked = self.window.contract, self.contract
         if recorded.rate_hz != asked.rate_hz:
             return "rate_hz"
-        if recorded.action_parts != asked.action_parts:
+        if recorded.action_joints != asked.action_joints:
             return "action"
         known = {part.key for part in recorded.observation_parts}
         keys = [key for key in self.policy.spec.observations if key in known]

@@ -134,10 +134,9 @@ class PolicyModel:
 
         All it looks at sums up to 1, the state included. Empty for other networks.
         """
-        network = getattr(self.network, "model", None)
-        cameras = list(self.network.config.image_features or {})
-        if self._checkpoint.type != "act" or network is None or not cameras or self._chunk is not None:
+        if self._checkpoint.type != "act" or self._chunk is not None or not self.network.config.image_features:
             return {}
+        network, cameras = self.network.model, list(self.network.config.image_features)
         weights: list[torch.Tensor] = []
         sizes: list[tuple[int, int]] = []
         hooks = (
