@@ -301,8 +301,8 @@ def model_of(window: Window, episode: Path, given: str, server: str = "") -> Mod
         document["models"] = models
     if not server:
         return Model(window, episode, _config(window, document), name)
-    known = attrs.fields_dict(installed_plugins().find("policy", models[name]["type"]).options)
-    if own := next((each for each in _ADDRESSES if each in known), None):
+    options = attrs.fields_dict(installed_plugins().find("policy", models[name]["type"]).options)
+    if own := next((each for each in _ADDRESSES if each in options), None):
         document["models"] = {**models, name: {**models[name], own: server}}
     elif document.get("transport"):
         document["transport"] = {**document["transport"], "connect": [server], "listen": []}
@@ -402,7 +402,7 @@ def looks_of(model: Model) -> Iterator[Shown]:
         for key, weights in model.attention(frame).items():
             share, at_s = 100 * float(weights.sum()), model.window.since(frame.stamp_ns)
             title = f"{key.rpartition('.')[2]} at {at_s:.1f} s: {share:.0f} % of what the model attends to"
-            yield Shown(title, reddened(frame.values[key], weights))
+            yield Shown(title, reddened(np.asarray(frame.values[key], np.uint8), weights))
 
 
 type _Change = Callable[[int, Values], Values]
@@ -469,7 +469,7 @@ def _changes_of_parts(model: Model, frames: Sequence[Frame]) -> Iterator[tuple[s
             continue
         names = [name for part in model.contract.parts(key) for name in part.feature.names or ()]
         shown = [frame.values[key] for frame in frames]
-        half, mean = len(shown) // 2, np.mean(shown, axis=0)
+        half, mean = len(shown) // 2, np.mean([each.astype(np.float64) for each in shown], axis=0)
         for j, name in enumerate(names if len(names) == shape[0] else ()):
             by: dict[str, Sequence[float]] = {
                 "of another time": [float(each[j]) for each in (*shown[half:], *shown[:half])],

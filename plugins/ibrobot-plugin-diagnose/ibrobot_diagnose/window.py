@@ -133,7 +133,9 @@ class Camera:
     def sample(self) -> NDArray[np.float32]:
         """Some of these, evenly over the window."""
         count = len(self.small)
-        return self.small[np.unique(np.linspace(0, count - 1, min(COMPARED, count)).round().astype(int))]
+        chosen = np.unique(np.linspace(0, count - 1, min(COMPARED, count)).round().astype(int))
+        result: NDArray[np.float32] = self.small[chosen]
+        return result
 
 
 @attrs.frozen
