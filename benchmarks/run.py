@@ -195,8 +195,8 @@ CLAIMS = (
     ),
     Claim(
         "explain",
-        "`ibrobot explain` names most strong faults that are planted in simulated runs first, and seldom accuses a healthy"
-        " run or a weak policy's set-up",
+        "`ibrobot explain` names most strong faults that are planted in simulated runs first, and seldom accuses a"
+        " healthy run or a weak policy's set-up",
         "docs/how-to/explain-a-failure.md",
         "explain.py",
         "`lerobot[dataset,diffusion,training]`",

@@ -151,7 +151,7 @@ class Registry:
             PluginError: as `find`, or if `make` of the descriptor returns something else.
         """
         made = self.find(kind, type_).make(*arguments)
-        wanted = getattr(import_module("ibrobot_core.interfaces"), kind.capitalize(), object)
+        wanted = vars(import_module("ibrobot_core.interfaces")).get(kind.capitalize(), object)
         if made is None or not isinstance(made, wanted):
             raise PluginError(f"make of {plugin_type(kind, type_)} returned {made!r}, which is no {wanted.__name__}")
         return made

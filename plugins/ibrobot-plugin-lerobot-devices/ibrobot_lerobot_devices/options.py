@@ -29,7 +29,7 @@ def _is_topic(instance: object, attribute: attrs.Attribute[Any], value: str) -> 
         raise ValueError(f"{value!r} is not a topic: a topic begins with /, e.g. {attribute.default}")
 
 
-_JOINTS = option(factory=dict, help="LeRobot's name of a joint -> joint of the robot, where they differ")
+_NAMES = option(factory=dict, help="LeRobot's name of a joint -> joint of the robot, where they differ")
 _UNITS = option(
     factory=dict,
     validator=_unit_names,
@@ -54,7 +54,7 @@ class RobotOptions:
 
     robot: str = option(validator=not_empty, help="LeRobot's type of the robot, e.g. koch_follower")
     config: Mapping[str, Any] = option(factory=dict, help=_CONFIG)
-    joints: Mapping[str, str] = _JOINTS
+    names: Mapping[str, str] = _NAMES
     units: Mapping[str, str] = _UNITS
     zero_at: str = _ZERO_AT
     anchored: tuple[str, ...] = option(
@@ -73,7 +73,7 @@ class RobotOptions:
 
     def choices(self) -> Choices:
         """What the options say about the conversion of units."""
-        return Choices(self.joints, self.units, self.zero_at, self.anchored, self.inverted)
+        return Choices(self.names, self.units, self.zero_at, self.anchored, self.inverted)
 
 
 @documented
@@ -83,7 +83,7 @@ class TeleopOptions:
 
     teleop: str = option(validator=not_empty, help="LeRobot's type of the teleoperator, e.g. koch_leader")
     config: Mapping[str, Any] = option(factory=dict, help=_CONFIG)
-    joints: Mapping[str, str] = _JOINTS
+    names: Mapping[str, str] = _NAMES
     units: Mapping[str, str] = _UNITS
     zero_at: str = _ZERO_AT
     inverted: tuple[str, ...] = _INVERTED
@@ -114,7 +114,7 @@ class TeleopOptions:
 
     def choices(self) -> Choices:
         """What the options say about the conversion of units."""
-        return Choices(self.joints, self.units, self.zero_at, (), self.inverted, self.scaled)
+        return Choices(self.names, self.units, self.zero_at, (), self.inverted, self.scaled)
 
 
 @documented

@@ -166,9 +166,9 @@ def check_camera(options: CameraOptions, robot: Robot, joints: tuple[str, ...]) 
 def check_joints(options: RobotOptions | TeleopOptions, robot: Robot) -> Iterator[OptionFault]:
     """Check that the options name joints of the robot."""
     known = robot.joint_names
-    for theirs, ours in options.joints.items():
+    for theirs, ours in options.names.items():
         if ours not in known:
-            yield OptionFault(("joints", theirs), f"unknown joint {ours!r}{did_you_mean(ours, known, 'known')}")
+            yield OptionFault(("names", theirs), f"unknown joint {ours!r}{did_you_mean(ours, known, 'known')}")
     kinds = ("anchored", "scaled", "inverted")
     for key, names in attrs.asdict(options, filter=lambda field, value: field.name in kinds).items():
         for i, name in enumerate(names):

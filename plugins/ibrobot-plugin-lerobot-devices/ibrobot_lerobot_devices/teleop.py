@@ -116,7 +116,7 @@ class LeRobotTeleop(Teleop):
                 "use a device of ibrobot for it, e.g. type: keyboard"
             )
         limits = dict(zip(robot.joint_names, zip(robot.lower, robot.upper, strict=True), strict=True))
-        known = {options.joints.get(base, base) for base in positions}
+        known = {options.names.get(base, base) for base in positions}
         self._joints = tuple(joint for joint in robot.joint_names if joint in known) or robot.joint_names
         mapped = map_joints(features, answer["motors"], options.choices(), self._joints, limits)
         self._names = [positions[each.feature] for each in mapped]

@@ -145,7 +145,7 @@ def map_joints(
         if base is None:
             raise UnitProblem(
                 f"LeRobot has no joint {joint!r}; it has {', '.join(positions) or 'none'}: give the names that differ "
-                "as joints: {LEROBOT'S: JOINT}"
+                "as names: {LEROBOT'S: JOINT}"
             )
         motor = motors.get(base, {})
         unit = unit_of(positions[base], motors, choices.units)

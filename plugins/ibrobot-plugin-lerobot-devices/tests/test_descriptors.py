@@ -56,7 +56,7 @@ def test_functions_of_the_descriptors(hook: str, options: Any) -> None:
             ("config", "disable_torque_on_disconnect"),
             "is control.stop here",
         ),
-        ({"joints": {"a": "gripped"}}, ("joints", "a"), "unknown joint 'gripped', did you mean 'gripper'?"),
+        ({"names": {"a": "gripped"}}, ("names", "a"), "unknown joint 'gripped', did you mean 'gripper'?"),
         ({"inverted": ("elbow",)}, ("inverted", 0), "unknown joint 'elbow', did you mean 'elbow_flex'?"),
     ],
 )

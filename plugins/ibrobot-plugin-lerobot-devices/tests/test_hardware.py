@@ -79,7 +79,7 @@ class TestUnits:
     def test_a_joint_of_another_name_is_given(self, motors: Motors) -> None:
         with pytest.raises(HardwareError, match="LeRobot has no joint 'shoulder_pan'; it has shoulder_pan, should"):
             LeRobotHardware(
-                options(motors, joints={"shoulder_pan": "other"}), control_context(clock=RealClock())
+                options(motors, names={"shoulder_pan": "other"}), control_context(clock=RealClock())
             ).connect()
 
 

@@ -104,7 +104,12 @@ class FakeHardware(SimulatedHardware):
 
 
 class FakeRealHardware(Hardware):
-    """`FakeHardware` that moves with the clock, like a real robot."""
+    """Joints that follow their command as time passes, like those of a real robot.
+
+    Args:
+        ctx: provides the joints and the clock.
+        lag_s: time constant [s].
+    """
 
     def __init__(self, ctx: Context, lag_s: float = 0.1) -> None:
         self._joints = FakeHardware(ctx, lag_s)

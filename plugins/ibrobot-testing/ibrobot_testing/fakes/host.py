@@ -31,7 +31,13 @@ from ibrobot_core.app import ControlMode, SourceWorker, StreamingRun, Subscripti
 
 
 class FakeSensor(Sensor):
-    """A camera that captures an image at every control period of the clock."""
+    """A camera that captures an image at every control period of the clock.
+
+    Args:
+        ctx: provides the clock.
+        width: width of the images [px].
+        height: height of the images [px].
+    """
 
     message_type: type[Message] = Image
 

@@ -1,0 +1,24 @@
+"""New packages for plugin authors: `ibrobot plugins new`, and simulated joints for their robot YAMLs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from ibrobot_core.api import HardwareDescriptor, Late, hookimpl
+from ibrobot_core.app import Command
+
+
+@hookimpl
+def ibrobot_commands() -> Iterable[Command]:
+    """The command that writes a package."""
+    yield Command("plugins new", Late("ibrobot_kit.new:NewPlugin"))
+
+
+@hookimpl
+def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
+    """Simulated joints."""
+    make = Late("ibrobot_testing.fakes.control:FakeHardware")
+    yield HardwareDescriptor(
+        "fake", lambda options, ctx: make(ctx), "joints that follow their commands, without a physical model",
+        simulated=True,
+    )  # fmt: skip
