@@ -235,7 +235,7 @@ def several_arms(path: Path, arms: Mapping[str, Sequence[float]]) -> Any:
         arm = read_mjcf(path).spec.copy()
         folder = Path(arm.modelfiledir) / arm.meshdir
         for mesh in arm.meshes:
-            mesh.name, mesh.file = mesh_name(mesh), str(folder / mesh.file)
+            mesh.name, mesh.file = mesh_name(mesh), str(folder / mesh.file) if mesh.file else ""  # or by its vertices
         arm.meshdir = ""
         for option in ("integrator", "iterations", "ls_iterations", "timestep", "cone", "impratio"):
             setattr(spec.option, option, getattr(arm.option, option))

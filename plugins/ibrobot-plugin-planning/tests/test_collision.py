@@ -89,6 +89,16 @@ def test_unchecked_pairs_are_adjacent_or_touch_always(arm):
     assert unchecked_pairs(arm, never=True).keys() > found.keys()
 
 
+def test_only_the_base_of_its_own_arm_is_connected_with_a_turret(tmp_path):
+    """The other arm's base stands, too, and the turret can meet it."""
+    places = (("left_", (0.0, 0.2, 0.0, 0.0)), ("right_", (0.0, -0.2, 0.0, 0.0)))
+    joints = tuple(f"{prefix}{name}" for prefix, _ in places for name in JOINTS)
+    connected = read_arm(write_arm(tmp_path), joints, places).adjacent()
+    assert ("left_base", "left_turret") in connected
+    assert ("right_base", "right_turret") in connected
+    assert {pair for pair in connected if pair[0][:5] != pair[1][:5]} == set()
+
+
 def test_what_may_touch_is_not_checked(arm):
     thing = box(0, 0, 0.46, 0.1, 0.1, 0.02)
     assert not Collisions(checked(arm), World({"thing": thing}), ARM).free(UP)

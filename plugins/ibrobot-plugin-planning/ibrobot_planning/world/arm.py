@@ -40,6 +40,8 @@ class LinkShape:
     """Pose in the frame of the joint, shape (4, 4)."""
     geometry: Any
     """The shape in Coal."""
+    tree: int = 0
+    """The tree of bodies to which the link belongs, e.g. one of two arms: MuJoCo's number of its root; 0: the world."""
 
 
 @attrs.frozen(eq=False)
@@ -131,6 +133,9 @@ class Arm:
         connected = set()
         for i, j in self.pairs():
             a, b = self.shapes[i], self.shapes[j]
+            # All that stands has the joint 0, so there the base of another arm would count as connected, too.
+            if a.tree != b.tree and a.tree and b.tree:
+                continue
             if self.model.parents[a.joint] == b.joint or self.model.parents[b.joint] == a.joint:
                 connected.add(sorted_pair(a.link, b.link))
         return connected
@@ -215,7 +220,8 @@ def _shapes(source: Any, bodies: Sequence[tuple[int, Vector]]) -> list[LinkShape
         body = int(source.geom_bodyid[geom])
         joint, frame = bodies[body]
         placed = frame @ placement(source.geom_pos[geom], source.geom_quat[geom])
-        shapes.append(LinkShape(source.body(body).name, joint, placed, _geometry(source, geom)))
+        tree = int(source.body_rootid[body])
+        shapes.append(LinkShape(source.body(body).name, joint, placed, _geometry(source, geom), tree))
     return shapes
 
 
