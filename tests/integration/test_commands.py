@@ -232,6 +232,8 @@ JSON = {
     "plugins --json": 0,
     "plugins show camera --json": 2,
     "plugins show opencv --json": 0,
+    "plugins check attrs --json": 2,
+    "plugins new teleop my_stick --out new --json": 0,
     "doctor --json": None,
     "camera list --json": 0,
     "camera calibrate BAD --json": 2,

@@ -1,4 +1,4 @@
-"""New packages for plugin authors: `ibrobot plugins new`, and simulated joints for their robot YAMLs."""
+"""New packages for plugin authors: `ibrobot plugins new` and `check`, and simulated joints for robot YAMLs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from ibrobot_core.app import Command
 
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
-    """The command that writes a package."""
+    """Commands for authors."""
+    yield Command("plugins check", Late("ibrobot_kit.check:CheckPlugin"))
     yield Command("plugins new", Late("ibrobot_kit.new:NewPlugin"))
 
 

@@ -132,4 +132,7 @@ def _hulls(shapes: Sequence[LinkShape]) -> Sequence[LinkShape]:
             points.append(corners @ shape.placement[:3, :3].T + shape.placement[:3, 3])
     if len(points) < 2:
         return shapes
-    return [LinkShape(shapes[0].link, shapes[0].joint, np.eye(4), hull(np.concatenate(points)), shapes[0].tree), *others]
+    return [
+        LinkShape(shapes[0].link, shapes[0].joint, np.eye(4), hull(np.concatenate(points)), shapes[0].tree),
+        *others,
+    ]

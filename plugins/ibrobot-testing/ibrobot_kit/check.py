@@ -1,0 +1,161 @@
+"""`ibrobot plugins check`: a report on a package, for its author and for its users."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib.metadata import Distribution, PackageNotFoundError, distribution, version
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+import attrs
+from packaging.requirements import Requirement
+
+from ibrobot_core.api import Check, Descriptor, Late, option
+from ibrobot_core.app import Registry, RequestError, Unsuccessful, echo, installed_plugins
+
+HEAVY = ("av", "cv2", "lerobot", "mujoco", "numpy", "pinocchio", "pyarrow", "scipy", "torch")
+"""Libraries that take long to import, and that each `ibrobot` command would import if a plugin did at discovery."""
+_CORE = "ibrobot-core"
+_TESTS_S = 600.0
+
+
+@attrs.frozen
+class CheckPlugin:
+    """Check the installed package PACKAGE as a plugin: what it offers, how it is discovered, and its tests.
+
+    What cannot be checked is listed, too. Exits with 1 if a check fails.
+    """
+
+    package: str = option(typed="PACKAGE", help="the name by which it is installed, e.g. ibrobot-plugin-wave")
+
+    def __call__(self) -> list[Check]:
+        """Check it."""
+        checks = [*examine(self.package, installed_plugins())]
+        if any(check.matters and not check.ok for check in checks):
+            raise Unsuccessful(checks)
+        return checks
+
+    def show(self, checks: list[Check]) -> None:
+        """Print them."""
+        for check in checks:
+            word = "ok  " if check.ok else ("FAIL" if check.matters else "note")
+            echo(f"{word}  {check.name}: {check.found}")
+            if not check.ok and check.remedy:
+                echo(f"      {check.remedy}")
+
+
+def examine(package: str, registry: Registry) -> Iterator[Check]:
+    """All checks of a package.
+
+    Raises:
+        RequestError: if it is not installed, or is no plugin.
+    """
+    try:
+        installed = distribution(package)
+    except PackageNotFoundError:
+        raise RequestError(f"{package} is not installed in this environment") from None
+    points = [each for each in installed.entry_points if each.group.partition(".")[0] == "ibrobot"]
+    if not points:
+        raise RequestError(
+            f"{package} {installed.version} has no entry point in the group `ibrobot`, so it is no plugin"
+        )
+    failures = [failure for failure in registry.failures if failure.package == installed.name]
+    for failure in failures:
+        yield Check("discovery", False, str(failure), "nothing, or not all, of what it offers is used")
+    entries = [entry for entry in registry.entries.values() if entry.package == installed.name]
+    offered = ", ".join(f"{entry.kind} {entry.descriptor.type}" for entry in entries)
+    if not failures:
+        yield Check("discovery", True, offered or "commands, events or other things without a type")
+    yield from _versions(installed)
+    for point in points:
+        yield _weight(point.module)
+    for entry in entries:
+        yield from _described(f"{entry.kind} {entry.descriptor.type}", entry.descriptor)
+    yield _tests(installed)
+
+
+def _versions(package: Distribution) -> Iterator[Check]:
+    """Which versions of core it permits."""
+    requirements = [Requirement(each) for each in package.requires or ()]
+    core = [each for each in requirements if each.name == _CORE]
+    if not core:
+        yield Check("versions", False, f"it does not require {_CORE}", f'add "{_CORE}>=0.1,<0.2" to its dependencies')
+        return
+    (asked,), has = core, version(_CORE)
+    fits = asked.specifier.contains(has, prereleases=True)
+    yield Check("versions", fits, f"{asked}; {has} is installed", f"install a version of {_CORE} that it permits")
+    if not any(each.operator in ("<", "<=", "==", "~=") for each in asked.specifier):
+        remedy = "interfaces change between minor versions before 1.0: add an upper bound, e.g. <0.2"
+        yield Check("versions", False, f"{asked} permits all later versions", remedy, matters=False)
+
+
+def _weight(module: str) -> Check:
+    """What discovery imports."""
+    code = f"import json, sys, {module}; print(json.dumps([name for name in {HEAVY!r} if name in sys.modules]))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    if done.returncode:
+        lines = done.stderr.strip().splitlines() or ["it ended without a word"]
+        return Check("weight", False, f"{module} cannot be imported alone: {lines[-1]}")
+    loaded = json.loads(done.stdout.splitlines()[-1])
+    remedy = 'each ibrobot command imports that: import it in `make`, e.g. by Late("MODULE:NAME")'
+    return Check("weight", not loaded, f"{module} imports {', '.join(loaded) or 'nothing heavy'}", remedy)
+
+
+def _described(name: str, descriptor: Descriptor[Any]) -> Iterator[Check]:
+    """What a descriptor says of its type."""
+    silent = [field.alias for field in attrs.fields(descriptor.options) if not field.metadata.get("help")]
+    remedy = "ibrobot plugins show and forms show it: write help=…"
+    yield Check(
+        name, not silent, f"options without help: {', '.join(silent)}" if silent else "options have help", remedy
+    )
+    if not descriptor.summary:
+        yield Check(name, False, "it has no summary", "lists of plugins show it")
+    if not isinstance(descriptor.make, Late):
+        yield Check(name, False, "make is a function: what it makes was not looked at", matters=False)
+        return
+    try:
+        made = descriptor.make.load()
+    except Exception as error:  # noqa: BLE001 - whatever the plugin raises
+        yield Check(name, False, f"{descriptor.make.place} cannot be imported: {error}", "name what is there")
+        return
+    lacking = sorted(made.__abstractmethods__) if inspect.isclass(made) and inspect.isabstract(made) else []
+    text = f"{made.__name__} lacks {', '.join(lacking)}" if lacking else f"{descriptor.make.place} is there"
+    yield Check(name, not lacking, text, "define these methods")
+
+
+def _tests(package: Distribution) -> Check:
+    """Run its tests, if its source is here."""
+    folder = _source(package)
+    if folder is None:
+        return Check(
+            "tests", False, "not run: wheels have no tests; install its source by pip install -e", matters=False
+        )
+    tests = folder / "tests"
+    texts = [file.read_text(encoding="utf-8") for file in sorted(tests.rglob("test_*.py"))] if tests.is_dir() else []
+    if not any("Suite)" in text for text in texts):
+        return Check(
+            "tests", False, f"{tests} has no conformance suite", "subclass the suite of its kind, of ibrobot_testing"
+        )
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"]
+    try:
+        done = subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, errors="replace", check=False, timeout=_TESTS_S
+        )
+    except subprocess.TimeoutExpired:
+        return Check("tests", False, f"did not end within {_TESTS_S:g} s", f"cd {folder} && pytest")
+    lines = done.stdout.strip().splitlines() or done.stderr.strip().splitlines() or ["no output"]
+    return Check("tests", done.returncode == 0, lines[-1].strip("= "), f"cd {folder} && pytest")
+
+
+def _source(package: Distribution) -> Path | None:
+    """The folder from which it is installed, if it is an editable one."""
+    told = package.read_text("direct_url.json")
+    facts = json.loads(told) if told else {}
+    if not facts.get("dir_info", {}).get("editable"):
+        return None
+    return Path(unquote(urlsplit(facts["url"]).path))

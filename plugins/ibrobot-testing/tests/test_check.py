@@ -1,0 +1,143 @@
+"""`ibrobot plugins check` names what is wrong with a package, and what it could not check."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from ibrobot_kit.check import CheckPlugin, examine
+from ibrobot_kit.new import NewPlugin
+from ibrobot_testing.site import Site, made_up_site
+
+from ibrobot_core.api import Check
+from ibrobot_core.app import RequestError, Unsuccessful, installed_plugins
+
+PLUGIN = """
+import attrs
+from ibrobot_core.api import Late, TeleopDescriptor, hookimpl, option
+
+
+@attrs.frozen
+class Options:
+    gain: float = option(1.0, ge=0, help="how fast")
+
+
+@hookimpl
+def ibrobot_teleop():
+    yield TeleopDescriptor("wave", Late("ibrobot_testing.fakes.host:FakeTeleop"), "waves", options=Options)
+"""
+REQUIRES = "ibrobot-core>=0.1,<0.2"
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+    with made_up_site(tmp_path / "site", tmp_path, monkeypatch) as site:
+        yield site
+
+
+def install(site: Site, plugin: str = PLUGIN, requires: str = REQUIRES) -> None:
+    """Install a plugin, as from a wheel."""
+    source = site.sources / "source.py"
+    source.write_text(plugin)
+    site.add("fake-wave", source)
+    metadata = site.folder / "fake_wave-1.0.dist-info/METADATA"
+    metadata.write_text(metadata.read_text() + (f"Requires-Dist: {requires}\n" if requires else ""))
+    installed_plugins.cache_clear()
+
+
+def checks() -> dict[str, Check]:
+    return {check.name: check for check in examine("fake-wave", installed_plugins())}
+
+
+def test_good_package_fails_nothing_and_says_what_was_not_run(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
+    install(site)
+    command = CheckPlugin("fake-wave")
+    done = command()
+    assert [check.name for check in done if not check.ok] == ["tests"]
+    command.show(done)
+    assert capsys.readouterr().out.splitlines() == [
+        "ok    discovery: teleop wave",
+        "ok    versions: ibrobot-core<0.2,>=0.1; 0.1.0 is installed",
+        "ok    weight: fake_wave imports nothing heavy",
+        "ok    teleop wave: options have help",
+        "ok    teleop wave: ibrobot_testing.fakes.host:FakeTeleop is there",
+        "note  tests: not run: wheels have no tests; install its source by pip install -e",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "name", "message"),
+    [
+        ('"wave"', '"my wave"', "discovery", "type 'my wave' is no name"),
+        ("import attrs\n", "import attrs, numpy\n", "weight", "fake_wave imports numpy"),
+        ("import attrs\n", "import attrs\nimport sys\nif sys.argv[0] == '-c': raise OSError('no port')\n", "weight",
+         "fake_wave cannot be imported alone: OSError: no port"),
+        (', help="how fast"', "", "teleop wave", "options without help: gain"),
+        (':FakeTeleop")', ':Nobody")', "teleop wave", "ibrobot_testing.fakes.host:Nobody cannot be imported"),
+        ("ibrobot_testing.fakes.host:FakeTeleop", "ibrobot_core.interfaces.teleop:Teleop", "teleop wave",
+         "Teleop lacks connect, disconnect, read"),
+    ],
+)  # fmt: skip
+def test_mistake_fails_with_its_cause(site: Site, old: str, new: str, name: str, message: str) -> None:
+    assert old in PLUGIN
+    install(site, PLUGIN.replace(old, new))
+    with pytest.raises(Unsuccessful) as failed:
+        CheckPlugin("fake-wave")()
+    wrong = [check for check in failed.value.result if check.matters and not check.ok]
+    assert [check.name for check in wrong] == [name]
+    assert message in wrong[0].found
+
+
+@pytest.mark.parametrize(
+    ("requires", "message", "fails"),
+    [
+        ("", "it does not require ibrobot-core", True),
+        ("ibrobot-core>=9,<10", "ibrobot-core<10,>=9; 0.1.0 is installed", True),
+        ("ibrobot-core>=0.1", "ibrobot-core>=0.1 permits all later versions", False),
+    ],
+)
+def test_versions_that_do_not_fit_are_named(site: Site, requires: str, message: str, *, fails: bool) -> None:
+    install(site, requires=requires)
+    check = checks()["versions"]
+    assert (check.ok, check.matters, check.found) == (False, fails, message)
+
+
+def test_function_that_makes_the_object_is_listed_as_not_looked_at(site: Site) -> None:
+    install(site, PLUGIN.replace("Late(", "lambda options, ctx: Late("))
+    check = checks()["teleop wave"]
+    assert (check.found, check.matters) == ("make is a function: what it makes was not looked at", False)
+
+
+def as_source(site: Site, folder: Path) -> None:
+    """Let the package be installed from a folder, as by `pip install -e`."""
+    facts = {"url": folder.as_uri(), "dir_info": {"editable": True}}
+    (site.folder / "fake_wave-1.0.dist-info/direct_url.json").write_text(json.dumps(facts))
+
+
+def test_tests_of_the_source_are_run(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(site)
+    folder = Path(NewPlugin("viewer", "odd_one", tmp_path / "a folder")()["folder"])
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+    as_source(site, folder)
+    assert checks()["tests"].ok
+    implementation = folder / "ibrobot_odd_one/viewer.py"
+    implementation.write_text(implementation.read_text().replace("return not self.person_closed", "return True"))
+    check = checks()["tests"]
+    assert not check.ok
+    assert "1 failed" in check.found
+    (folder / "tests/test_odd_one.py").write_text("def test_nothing(): pass\n")
+    assert checks()["tests"].found.endswith("has no conformance suite")
+
+
+@pytest.mark.parametrize(
+    ("package", "message"),
+    [
+        ("nobody-has-this", "nobody-has-this is not installed in this environment"),
+        ("attrs", "has no entry point in the group `ibrobot`, so it is no plugin"),
+    ],
+)
+def test_what_is_no_plugin_is_an_error(package: str, message: str) -> None:
+    with pytest.raises(RequestError, match=message):
+        CheckPlugin(package)()
