@@ -58,6 +58,7 @@ WRONG_FILES = {
     "description srdf BAD": (),
     "eval merge BAD --out new": (),
     "lerobot new BAD koch_follower": ("missing",),
+    "plugins new teleop my_stick --out BAD": ("missing", "folder"),
     "episodes answers BAD": (),
     "episodes delete BAD --yes": (),
     "episodes export BAD /joint_states -o new.csv": (),
@@ -111,7 +112,8 @@ WRONG_FILES = {
 }
 """Command line -> the kinds of files that are right there."""
 WITHOUT_FILES = {
-    "config schema", "plugins", "plugins show", "doctor", "camera list", "feetech find-port", "gamepad list",
+    "plugins check",
+    "config schema", "plugins show", "doctor", "camera list", "feetech find-port", "gamepad list",
     "gamepad test", "gamepad udev", "lerobot list", "lerobot torque-off", "datasets pull",
 }  # fmt: skip
 KINDS = ("missing", "folder", "binary", "unreadable", "empty")
