@@ -23,6 +23,7 @@ FAKES = {
     "sensor": "host:FakeSensor",
     "teleop": "host:FakeTeleop",
     "policy": "host:FakePolicy",
+    "engine": "host:FakeEngine",
     "executor": "control:FakeExecutor",
     "recorder": "storage:FakeRecorder",
     "transport": "transport:FakeTransport",
@@ -92,6 +93,7 @@ def render(kind: str, name: str) -> dict[str, str]:
         ("the fake hardware", "the arm"),
         ("the fake device", "the device"),
         ('"a fake"', f'"{name}"'),
+        ('"fake"', f'"{name}"'),
         ("/fake/", f"/{name}/"),
     ):
         body = body.replace(old, new)
@@ -124,10 +126,10 @@ def render(kind: str, name: str) -> dict[str, str]:
 
 
 def _options(fake: type[Any]) -> Iterator[dict[str, Any]]:
-    """The arguments of a fake that have a default, as options."""
+    """The arguments of a fake that it describes and that have a default, as options."""
     described = dict(re.findall(r"^\s+(\w+): (.*)\.$", inspect.getdoc(fake) or "", re.MULTILINE))
     for argument in inspect.signature(fake).parameters.values():
-        if argument.default is not inspect.Parameter.empty:
+        if argument.default is not inspect.Parameter.empty and argument.name in described:
             text, _, unit = described[argument.name].rstrip("]").partition(" [")
             given = f'unit="{unit}", ' if unit else ""
             yield {

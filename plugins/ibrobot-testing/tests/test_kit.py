@@ -65,7 +65,7 @@ def test_new_packages_are_discovered_without_mistakes_and_their_robots_are_right
 
 @pytest.mark.parametrize(
     "kind",
-    [kind if kind == "policy" else pytest.param(kind, marks=pytest.mark.long) for kind in FAKES],
+    [kind if kind == "engine" else pytest.param(kind, marks=pytest.mark.long) for kind in FAKES],
 )
 def test_robot_of_a_new_package_runs(packages: Path, kind: str) -> None:
     (robot,) = packages.glob(f"*/my_{kind}.yaml")
