@@ -76,7 +76,7 @@ def test_good_package_fails_nothing_and_says_what_was_not_run(site: Site, capsys
          "fake_wave cannot be imported alone: OSError: no port"),
         (', help="how fast"', "", "teleop wave", "options without help: gain"),
         (':FakeTeleop")', ':Nobody")', "teleop wave", "ibrobot_testing.fakes.host:Nobody cannot be imported"),
-        ("ibrobot_testing.fakes.host:FakeTeleop", "ibrobot_core.interfaces.teleop:Teleop", "teleop wave",
+        ("ibrobot_testing.fakes.host:FakeTeleop", "ibrobot_core.api:Teleop", "teleop wave",
          "Teleop lacks connect, disconnect, read"),
     ],
 )  # fmt: skip
