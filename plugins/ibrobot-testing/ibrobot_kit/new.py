@@ -60,7 +60,7 @@ class NewPlugin:
             raise RequestError(f"NAME is {self.name!r}: use lower-case letters, digits and _, e.g. my_arm")
         folder = self.out / f"ibrobot-plugin-{self.name.replace('_', '-')}"
         if self.out.exists() and not self.out.is_dir():
-            raise RequestError(f"--out {self.out}: is no folder")
+            raise RequestError(f"--out {self.out}: is not a folder")
         if folder.exists():
             raise RequestError(f"{folder} exists; choose another name, or move it away")
         files = render(self.kind, self.name)
