@@ -131,8 +131,14 @@ def asked_again(
         model.close()
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("kind", [pytest.param(each, marks=[pytest.mark.long] * (each == "vqbet")) for each in KINDS])
+ASKED = [
+    pytest.param(kind, mode, marks=[] if kind == "act" and mode != "distributed" else [pytest.mark.long])
+    for kind in KINDS
+    for mode in MODES
+]
+
+
+@pytest.mark.parametrize(("kind", "mode"), ASKED)
 def test_answers_are_equal_bit_for_bit(kind: str, mode: str, recorded: Callable[..., tuple[Path, str]]) -> None:
     episode, endpoint = recorded(kind, mode)
     for server in {"", endpoint}:
@@ -166,6 +172,7 @@ def test_another_checkpoint_is_named(change: Any, whose: str, root: Path, record
     assert said.startswith(whose)
 
 
+@pytest.mark.long
 def test_policy_that_ignores_its_pictures_is_named(root: Path, recorded: Any) -> None:
     blind = save(KINDS["act"](), root / "blind")
     tensors = load_file(blind / "model.safetensors")
