@@ -449,7 +449,7 @@ class _Plugin:
 
     def double(self, registry: Registry, kind: str, name: str, owner: str, hook: str) -> None:
         """Register that another package offers it, too. It is refused where it is used; what core offers stays."""
-        if owner != CORE:
+        if owner not in (CORE, self.package):  # a package that is on the path twice is one
             registry.doubles.setdefault((kind, name), [owner]).append(self.package)
         self.refuse(registry, f"{plugin_type(kind, name)} is offered by {owner} already", hook)
 

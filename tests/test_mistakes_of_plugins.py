@@ -91,6 +91,12 @@ def test_types_of_two_packages_are_refused_where_they_are_used(site: Site, tmp_p
         registry.find("teleop", "wave")
 
 
+def test_package_that_is_on_the_path_twice_is_one(site: Site, tmp_path: Path) -> None:
+    offer(site, tmp_path, HEAD + YIELDS)
+    registry = discover(site.entry_points() * 2)
+    assert registry.find("teleop", "wave").summary == "waves"
+
+
 def test_type_of_core_stays_that_of_core(site: Site, tmp_path: Path) -> None:
     source = HEAD.replace("HardwareDescriptor", "ExecutorDescriptor") + YIELDS.replace(
         "ibrobot_teleop", "ibrobot_executors"

@@ -31,7 +31,7 @@ def only(monkeypatch: pytest.MonkeyPatch) -> Iterator[Only]:
     def choose(*names: str) -> None:
         installed = [entry for entry in entry_points(group="ibrobot") if entry.dist is not None]
         found = [each for each in installed if each.name in names or (each.dist and each.dist.name == plugins.CORE)]
-        monkeypatch.setattr(plugins, "entry_points", lambda group: found)
+        monkeypatch.setattr(plugins, "entry_points", lambda: found)
         installed_plugins.cache_clear()
 
     yield choose

@@ -233,7 +233,7 @@ def test_fewer_actions_on_demand(folders: dict[str, Path]) -> None:
 
 def test_identity_states_what_computes_and_how(folders: dict[str, Path]) -> None:
     cpu = torch.backends.cpu.get_cpu_capability()
-    identity = loaded(folders["act"], threads=1).identity()
+    identity = loaded(folders["act"]).identity()
     assert identity.endswith(f"torch {version('torch')}, cpu, {cpu}, threads 1")
     assert ", cpu in bfloat16, " in loaded(folders["act"], dtype="bfloat16").identity()
 
