@@ -268,7 +268,7 @@ def slow(seconds: float) -> None:
         setup(self)
         client = Late(self._model.policy, self._model.engine)
         client.clock = self.session.clock
-        self._client = self._dispatcher._client = client  # type: ignore[attr-defined]
+        self._client = self._dispatcher._client = client
 
     PolicySource.setup = new_setup  # type: ignore[method-assign]
 

@@ -19,10 +19,12 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Station, Judge]:
 
 
 def test_no_command_leads_into_contact(judged) -> None:
-    result = guard_trials.commanded(*judged, 0, 120, guarded=True)
+    station, judge = judged
+    result = guard_trials.commanded(station, judge, 0, 120, guarded=True)
     assert (result.commands, result.touched) == (120, 0)
     assert result.kept > -0.001, result.worst
 
 
 def test_an_operator_gets_out(judged) -> None:
-    assert guard_trials.backs_out(*judged, 0) == ""
+    station, judge = judged
+    assert guard_trials.backs_out(station, judge, 0) == ""

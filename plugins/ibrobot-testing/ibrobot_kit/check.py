@@ -119,11 +119,11 @@ def _described(name: str, descriptor: Descriptor[Any]) -> Iterator[Check]:
         yield Check(name, False, "make is a function: what it makes was not looked at", matters=False)
         return
     try:
-        made = descriptor.make.load()
+        made: Any = descriptor.make.load()
     except Exception as error:  # noqa: BLE001 - whatever the plugin raises
         yield Check(name, False, f"{descriptor.make.place} cannot be imported: {error}", "name what is there")
         return
-    lacking = sorted(made.__abstractmethods__) if inspect.isclass(made) and inspect.isabstract(made) else []
+    lacking = sorted(made.__abstractmethods__) if inspect.isabstract(made) else []
     text = f"{made.__name__} lacks {', '.join(lacking)}" if lacking else f"{descriptor.make.place} is there"
     yield Check(name, not lacking, text, "define these methods")
 

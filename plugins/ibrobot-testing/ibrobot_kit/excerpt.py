@@ -36,8 +36,8 @@ def excerpt(module: ModuleType, name: str) -> tuple[list[str], str]:
     nodes = [node for key, node in own.items() if key in wanted]
     used = {each for node in nodes for each in _names(node)}
     imports: list[str] = []
-    for node in tree.body:
-        for line in _import(node, used):
+    for statement in tree.body:
+        for line in _import(statement, used):
             if imports and _group(line) != _group(imports[-1]):
                 imports.append("")
             imports.append(line)
