@@ -93,7 +93,7 @@ class Descriptor[T]:
     def mistakes(self) -> Iterator[str]:
         """What is wrong with it, in words for its author."""
         if not re.fullmatch(r"[A-Za-z0-9][\w.-]*", self.type):
-            yield f"type {self.type!r} is no name: use letters, digits and _, e.g. my_arm"
+            yield f"type {self.type!r} is not a name: use letters, digits and _, e.g. my_arm"
         if not callable(self.make):
             yield f"make is {self.make!r}: give a class, or a function that makes the object"
         if lacking := sorted(getattr(self.make, "__abstractmethods__", ())):

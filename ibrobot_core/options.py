@@ -156,7 +156,7 @@ def fields(kind: type[Any]) -> Mapping[str, attrs.Attribute[Any]]:
 def mistakes(kind: Any) -> Iterator[str]:
     """What is wrong with an options class, in words for its author."""
     if not (isinstance(kind, type) and attrs.has(kind)):
-        yield f"{kind!r} is no attrs class: decorate it with @attrs.frozen"
+        yield f"{kind!r} is not an attrs class: decorate it with @attrs.frozen"
         return
     if kind.__hash__ is None:  # as of `attrs.define`
         yield f"{kind.__name__} can be changed: decorate it with @attrs.frozen"

@@ -153,7 +153,7 @@ class Registry:
         made = self.find(kind, type_).make(*arguments)
         wanted = vars(import_module("ibrobot_core.interfaces")).get(kind.capitalize(), object)
         if made is None or not isinstance(made, wanted):
-            raise PluginError(f"make of {plugin_type(kind, type_)} returned {made!r}, which is no {wanted.__name__}")
+            raise PluginError(f"make of {plugin_type(kind, type_)} returned {made!r}; expected {wanted.__name__}")
         return made
 
     def command(self, name: str) -> descriptors.Command:

@@ -35,12 +35,12 @@ def ibrobot_teleop():
 """
 OPTIONS = "option(1.0, ge=0)"
 MISTAKES = {
-    "empty type": ('"wave"', '""', "type '' is no name: use letters, digits and _, e.g. my_arm"),
-    "type with a blank": ('"wave"', '"my wave"', "type 'my wave' is no name"),
-    "type with an escape": ('"wave"', r'"wave\033[1m"', r"type 'wave\x1b[1m' is no name"),
+    "empty type": ('"wave"', '""', "type '' is not a name: use letters, digits and _, e.g. my_arm"),
+    "type with a blank": ('"wave"', '"my wave"', "type 'my wave' is not a name"),
+    "type with an escape": ('"wave"', r'"wave\033[1m"', r"type 'wave\x1b[1m' is not a name"),
     "no make": ("Wave,", "None,", "make is None: give a class, or a function that makes the object"),
     "abstract class": ("Wave,", "Teleop,", "make is an abstract class: it lacks connect, disconnect, read"),
-    "options of a plain class": ("@attrs.frozen", "", "options: <class 'fake_wave.Options'> is no attrs class"),
+    "options of a plain class": ("@attrs.frozen", "", "options: <class 'fake_wave.Options'> is not an attrs class"),
     "options that change": ("@attrs.frozen", "@attrs.define", "options: Options can be changed: decorate it with"),
     "options of no class": ("options=Options", "options=Options()", "must be a builtins.type[Any], not Options(gain="),
     "default out of range": (
@@ -122,7 +122,7 @@ def test_plugin_for_another_version_of_the_interface_says_what_to_update(site: S
 @pytest.mark.parametrize(
     ("made", "message"),
     [
-        ("None", "make of teleop type 'wave' returned None, which is no Teleop"),
+        ("None", "make of teleop type 'wave' returned None; expected Teleop"),
         ("Wave()", "make of teleop type 'wave' returned <fake_wave.Wave object at "),
     ],
 )

@@ -97,6 +97,10 @@ def test_two_commands_of_one_name_are_a_failure_of_the_later_plugin(site: Site) 
     with pytest.raises(PluginError, match="ibrobot juggle is offered by fake-first and fake-second: uninstall all but"):
         registry.command("juggle")
     assert registry.command("doctor").summary != "juggles, as fake_first does"
+    used = _ibrobot("juggle")
+    assert (used.returncode, used.stderr.count("is offered by fake-first and fake-second: uninstall all but")) == (2, 1)
+    assert _ibrobot("--help").returncode == 0
+    assert _ibrobot("doctor", "--help").returncode == 0
 
 
 def test_a_plugin_defines_a_kind_that_others_offer(site: Site) -> None:

@@ -72,7 +72,7 @@ class Commands(click.Group):
             if any(name in offers.get("command", ()) for offers in official_plugins().values()):
                 raise registry.not_found("command", name)
             return None
-        return _click_command(registry.commands[name])
+        return _click_command(registry.command(name))
 
     @override
     def make_context(

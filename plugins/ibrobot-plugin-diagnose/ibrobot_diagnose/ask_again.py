@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -39,6 +40,7 @@ from ibrobot_diagnose.pictures import reddened
 from ibrobot_diagnose.window import Asked, Floats, Window
 
 ACTION = "action"
+_log = logging.getLogger("ibrobot.diagnose")
 _MOST, _MOST_OF_PARTS = 8, 3
 """Frames on which the model is asked with changed observations, and with changed parts of a vector."""
 _ADDRESSES = ("url", "address", "server")
@@ -127,18 +129,18 @@ class Model:
         config, registry = self._config, installed_plugins()
         inference = config.control_modes[self.window.metadata["mode"]].inference
         if self._asked_there and config.transport is not None:
-            descriptor = registry.find("transport", config.transport.type)
             context = Context.of(config, "transport", RealClock(), self._seed)
-            self._transport = descriptor.make(config.transport.options, context)
+            self._transport = registry.create("transport", config.transport.type, config.transport.options, context)
         kind = inference.type if inference is not None and self._asked_there else _HERE
-        engines = registry.find("engine", kind)
-        options = inference.options if inference is not None and kind == inference.type else engines.options()
+        options = registry.find("engine", kind).options()
+        if inference is not None and kind == inference.type:
+            options = inference.options
         model = ModelContext(config, self.policy, self._transport)
         context = Context.of(config, self._name, RealClock(), self._seed, model=model)
-        self._engine = engines.make(options, context)
-        self._engine.start()
+        self._engine = engine = registry.create("engine", kind, options, context)
+        engine.start()
         self.policy.reset(self._seed)
-        self._engine.reset(self._seed)
+        engine.reset(self._seed)
 
     @property
     def engine(self) -> Engine:
@@ -361,7 +363,8 @@ def effects(model: Model) -> list[Effect]:
             moved = [
                 np.abs(model.answer(_changed(frames[i], i, change), prompt) - plain[i]).mean(axis=0) for i in numbers
             ]
-        except Exception:  # noqa: BLE001 - what cannot be, e.g. a rotation of zeros, may raise anything in a model
+        except Exception as error:  # noqa: BLE001 - what cannot be, e.g. a rotation of zeros, may raise anything
+            _log.info("the model gives no answer with %s %s: %s", what, how, error)
             continue
         means = np.mean(moved, axis=0)
         listed.append(Effect(what, how, dict(zip(model.contract.action_names, map(float, means), strict=False))))

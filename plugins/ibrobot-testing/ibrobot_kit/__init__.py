@@ -1,4 +1,4 @@
-"""New packages for plugin authors: `ibrobot plugins new` and `check`, and simulated joints for robot YAMLs."""
+"""New packages for plugin authors: `ibrobot plugins new` and `check`, and what their robot YAMLs need."""
 
 from __future__ import annotations
 

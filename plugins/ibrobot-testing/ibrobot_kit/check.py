@@ -53,7 +53,7 @@ def examine(package: str, registry: Registry) -> Iterator[Check]:
     """All checks of a package.
 
     Raises:
-        RequestError: if it is not installed, or is no plugin.
+        RequestError: if it is not installed, or is not a plugin.
     """
     try:
         installed = distribution(package)
@@ -62,7 +62,7 @@ def examine(package: str, registry: Registry) -> Iterator[Check]:
     points = [each for each in installed.entry_points if each.group.partition(".")[0] == "ibrobot"]
     if not points:
         raise RequestError(
-            f"{package} {installed.version} has no entry point in the group `ibrobot`, so it is no plugin"
+            f"{package} {installed.version} has no entry point in the group `ibrobot`, so it is not a plugin"
         )
     failures = [failure for failure in registry.failures if failure.package == installed.name]
     for failure in failures:

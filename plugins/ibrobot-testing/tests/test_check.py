@@ -70,7 +70,7 @@ def test_good_package_fails_nothing_and_says_what_was_not_run(site: Site, capsys
 @pytest.mark.parametrize(
     ("old", "new", "name", "message"),
     [
-        ('"wave"', '"my wave"', "discovery", "type 'my wave' is no name"),
+        ('"wave"', '"my wave"', "discovery", "type 'my wave' is not a name"),
         ("import attrs\n", "import attrs, numpy\n", "weight", "fake_wave imports numpy"),
         ("import attrs\n", "import attrs\nimport sys\nif sys.argv[0] == '-c': raise OSError('no port')\n", "weight",
          "fake_wave cannot be imported alone: OSError: no port"),
@@ -135,7 +135,7 @@ def test_tests_of_the_source_are_run(site: Site, tmp_path: Path, monkeypatch: py
     ("package", "message"),
     [
         ("nobody-has-this", "nobody-has-this is not installed in this environment"),
-        ("attrs", "has no entry point in the group `ibrobot`, so it is no plugin"),
+        ("attrs", "has no entry point in the group `ibrobot`, so it is not a plugin"),
     ],
 )
 def test_what_is_no_plugin_is_an_error(package: str, message: str) -> None:
