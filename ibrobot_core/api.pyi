@@ -63,7 +63,6 @@ from ibrobot_core.interfaces.hardware import (
 )
 from ibrobot_core.interfaces.teleop import Approach as Approach
 from ibrobot_core.deadman import Deadman as Deadman
-from ibrobot_core.keys import HeldKeys as HeldKeys, KeyEvent as KeyEvent
 
 # Calibration
 from ibrobot_core.calibration import (

@@ -76,7 +76,7 @@ from ibrobot_core.launch.runtime import Runtime as Runtime
 from ibrobot_core.component import Component as Component, SessionWorker as SessionWorker, CONTROL as CONTROL
 from ibrobot_core.bug_reports import error_line as error_line, error_text as error_text
 from ibrobot_core.interfaces.run_state import ControlState as ControlState
-from ibrobot_core.run_hooks import RunHooks as RunHooks, RUN_KEYS as RUN_KEYS
+from ibrobot_core.run_hooks import RunHooks as RunHooks, RUN_KEYS as RUN_KEYS, check_key as check_key
 from ibrobot_core.launch.episodes import Episodes as Episodes
 from ibrobot_core.component import TransportLink as TransportLink
 from ibrobot_core.launch.models import check_models as check_models
@@ -157,7 +157,7 @@ from ibrobot_core.events import (
 from ibrobot_core.events import Ask as Ask, Choice as Choice, Sight as Sight, Answer as Answer
 from ibrobot_core.safe_output import echo as echo, confirm as confirm, prompt as prompt, LogFormatter as LogFormatter
 from ibrobot_core.screen import Screen as Screen, styled as styled
-from ibrobot_core.terminal import KeyReader as KeyReader, check_key as check_key
+from ibrobot_core.cli.display import RunDisplay as RunDisplay, RunTerminal as RunTerminal
 from ibrobot_core.signals import on_signals as on_signals, end_signals as end_signals
 
 # Jobs

@@ -58,7 +58,7 @@ class Failed(Event):
 class Choice:
     """An answer that an operator can choose: by a button, or by one key."""
 
-    key: str = option(help="the key, as `KeyReader` names it")
+    key: str = option(help="the key, by the character that it types or its name, e.g. `enter`")
     text: str = option(help="what it does, in lower case")
     urgent: bool = option(False, help="whether it stops a robot")
 

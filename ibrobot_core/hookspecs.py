@@ -95,6 +95,11 @@ def ibrobot_viewers() -> Iterable[descriptors.ViewerDescriptor]:  # type: ignore
 
 
 @hookspec
+def ibrobot_terminals() -> Iterable[descriptors.Descriptor]:  # type: ignore[empty-body, type-arg]
+    """Terminals, which read keys and show runs: `make` gives a `RunTerminal`."""
+
+
+@hookspec
 def ibrobot_sections() -> Iterable[descriptors.SectionDescriptor]:  # type: ignore[empty-body]
     """Sections that this plugin adds to the robot YAML."""
 

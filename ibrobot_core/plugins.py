@@ -48,6 +48,7 @@ KINDS: Mapping[str, str] = {
     "transport": "ibrobot_transports",
     "recorder": "ibrobot_recorders",
     "viewer": "ibrobot_viewers",
+    "terminal": "ibrobot_terminals",
     "section": "ibrobot_sections",
 }
 """Plugin kind -> its registration hook."""

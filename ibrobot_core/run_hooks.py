@@ -1,10 +1,15 @@
-"""The keys of every run, and hooks for the keys and status rows that a command adds to them."""
+"""The names of keys, the keys of every run, and hooks for the keys and status rows that a command adds to them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
+KEY_NAMES = (
+    "space", "enter", "tab", "backspace", "esc", "up", "down", "right", "left", "home", "end",
+    *(f"f{i}" for i in range(1, 13)), "insert", "delete", "page_up", "page_down",
+)  # fmt: skip
+"""The keys with a name; every other key is the character that it types."""
 RUN_KEYS: Mapping[str, str] = {
     "esc": "emergency stop",
     "tab": "start and end of an episode",
@@ -15,6 +20,16 @@ RUN_KEYS: Mapping[str, str] = {
     "f12": "end of an episode",
 }
 """Key -> its meaning in every run; devices and sections may only use it for the same."""
+
+
+def check_key(key: str) -> None:
+    """Check the name of a key.
+
+    Raises:
+        ValueError: if no key has it.
+    """
+    if key not in KEY_NAMES and not (len(key) == 1 and key.isprintable() and key != " "):
+        raise ValueError(f"{key!r} is not a key: give the character that it types, or a name: {', '.join(KEY_NAMES)}")
 
 
 class RunHooks:

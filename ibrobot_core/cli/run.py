@@ -16,27 +16,27 @@ from contextlib import ExitStack, nullcontext, suppress
 
 import attrs
 
-from ibrobot_core.cli.panel import RecentLog, RecentRates, panel, plain_line
+from ibrobot_core.cli.display import Lines, RunDisplay, RunTerminal
+from ibrobot_core.clock import RealClock
 from ibrobot_core.config import RobotConfig
-from ibrobot_core.errors import IbrobotError, RequestError, TeleopError
+from ibrobot_core.errors import IbrobotError, PluginError, RequestError, TeleopError
+from ibrobot_core.interfaces import Context
 from ibrobot_core.interfaces.run import LaunchRequest
-from ibrobot_core.keys import RELEASE, REPEAT
 from ibrobot_core.launch.models import check_models
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Session
+from ibrobot_core.options import NoOptions
 from ibrobot_core.output_thread import discard, output_aside
-from ibrobot_core.plugins import installed_plugins
+from ibrobot_core.plugins import Registry, installed_plugins
 from ibrobot_core.pulses import PULSE_S, Pulse
 from ibrobot_core.run_hooks import RunHooks
-from ibrobot_core.safe_output import LogFormatter, echo
+from ibrobot_core.safe_output import echo
 from ibrobot_core.signals import end_signals
-from ibrobot_core.terminal import KeyReader
 
 NOT_ALL_SUCCEEDED = 3
 _FAULTED = 1
 _INTERRUPTED_TWICE = 130
-_PANEL_HZ = 8
-_PLAIN_PERIOD_S = 2.0
+_SHOWN_HZ = 8
 _READER_S = 1.0
 """Wait for a stalled stdout reader after a signal [s]."""
 _KEYS_BLOCKED_S = 2.0
@@ -68,7 +68,11 @@ def run_robot(
     if headless and config.viewer is not None:
         config = attrs.evolve(config, viewer=None)
     with ExitStack() as stack:
-        keys = KeyReader() if sys.stdin.isatty() and not (headless or dry_run) else None
+        output = sys.stderr if as_json else sys.stdout
+        terminal = None
+        if not (headless or dry_run) and (sys.stdin.isatty() or output.isatty()):
+            terminal = _terminal(config, installed_plugins())
+        keys = terminal if sys.stdin.isatty() else None
         if keys is not None:
             request = attrs.evolve(request, keys=keys.subscribe)
         runtime = Runtime(Session(config, installed_plugins(), request))
@@ -85,7 +89,7 @@ def run_robot(
             _watch_keys(runtime.session, keys)
             stack.enter_context(keys)
         try:
-            status = _run(runtime, hooks, signals, live=not headless, as_json=as_json)
+            status = _run(runtime, hooks, signals, terminal if output.isatty() else None, as_json=as_json)
         finally:
             for line in runtime.session.outcome.holding:
                 echo(line, err=True)
@@ -94,10 +98,23 @@ def run_robot(
     sys.exit(status)
 
 
-def _run(runtime: Runtime, hooks: RunHooks, signals: _Signals, *, live: bool, as_json: bool) -> int:
+def _terminal(config: RobotConfig, registry: Registry) -> RunTerminal | None:
+    """The terminal of a run, or None and a warning if no plugin has one."""
+    try:
+        type_ = registry.default("terminal")
+    except PluginError as error:
+        logging.getLogger("ibrobot").warning("neither panel nor keys, so Esc does not stop the robot: %s", error)
+        return None
+    made: RunTerminal = registry.create("terminal", type_, NoOptions(), Context.of(config, "terminal", RealClock()))
+    return made
+
+
+def _run(
+    runtime: Runtime, hooks: RunHooks, signals: _Signals, terminal: RunTerminal | None, *, as_json: bool
+) -> int:  # fmt: skip
     """Start, run and stop; return the exit status of a run without failures.
 
-    Status goes to standard output, or to standard error with `as_json`.
+    The terminal shows the run, or else status lines do, on standard output, or on standard error with `as_json`.
 
     Raises:
         KeyboardInterrupt: if a signal came before the run began.
@@ -105,15 +122,19 @@ def _run(runtime: Runtime, hooks: RunHooks, signals: _Signals, *, live: bool, as
     session = runtime.session
     where = "simulation" if session.config.simulated else "hardware"
     with ExitStack() as stack:
-        panel_fits = live and (sys.stderr if as_json else sys.stdout).isatty()
-        display = (_Panel if panel_fits else _Lines)(runtime, hooks, stack, err=as_json)
+        if terminal is None:
+            display: RunDisplay = Lines(runtime, hooks, err=as_json)
+        else:
+            display = terminal.display(runtime, hooks, stack, err=as_json)
+        _log_to(display.log)
+        _listen(session, display.press)
         config = session.config
         session.log.info("%s from %s: %s, mode %s", config.robot.name, config.source, where, session.mode)
         runtime.start(display.starting)
         stack.callback(runtime.stop)
         if signals.came:
             raise KeyboardInterrupt
-        while not (runtime.step() if session.request.lockstep else runtime.wait(1.0 / _PANEL_HZ)):
+        while not (runtime.step() if session.request.lockstep else runtime.wait(1.0 / _SHOWN_HZ)):
             hooks.step()
             display.show()
     outcome = session.outcome
@@ -122,7 +143,7 @@ def _run(runtime: Runtime, hooks: RunHooks, signals: _Signals, *, live: bool, as
     return NOT_ALL_SUCCEEDED if outcome.successes < outcome.episodes or outcome.goals_failed else 0
 
 
-def _watch_keys(session: Session, keys: KeyReader) -> None:
+def _watch_keys(session: Session, keys: RunTerminal) -> None:
     """End the run when the terminal's keys, including the emergency stop, are no longer read."""
     pulse = Pulse("keys of the terminal", _KEYS_BLOCKED_S)
     session.pulses.add(pulse)
@@ -145,7 +166,7 @@ class _Signals:
         came: whether a signal ended the run.
     """
 
-    def __init__(self, session: Session, keys: KeyReader | None) -> None:
+    def __init__(self, session: Session, keys: RunTerminal | None) -> None:
         self._session = session
         self._keys = keys
         self._terminals = [fd for fd in (1, 2) if os.isatty(fd)]
@@ -202,7 +223,7 @@ class _Signals:
             os.kill(os.getpid(), signal.SIGSTOP)
 
 
-def _listen(session: Session, take: Callable[[tuple[str, int]], None]) -> None:
+def _listen(session: Session, take: Callable[[str, int], None]) -> None:
     """Stop the robot at Esc, in every mode and view; `take` gets other keys with the number of emergency stops.
 
     A thread does it, so that the emergency stop does not wait, e.g. for a mode that loads.
@@ -218,114 +239,12 @@ def _listen(session: Session, take: Callable[[tuple[str, int]], None]) -> None:
             pulse.beat()
             with suppress(queue.Empty):
                 key = keys.get(timeout=PULSE_S)
-                if key.startswith((REPEAT, RELEASE)):
-                    continue
                 if key == "esc":
                     _try(session, session.emergency_stop)
                 else:
-                    take((key, session.stops))
+                    take(key, session.stops)
 
     threading.Thread(target=work, name="runtime keys", daemon=True).start()
-
-
-class _Lines:
-    """Plain status lines, for output without a terminal."""
-
-    def __init__(self, runtime: Runtime, hooks: RunHooks, stack: ExitStack, *, err: bool) -> None:
-        self._session = runtime.session
-        self._hooks = hooks
-        self._err = err
-        self._rates = RecentRates()
-        self._next_s = time.monotonic() + _PLAIN_PERIOD_S
-        handler = logging.StreamHandler(sys.stderr)
-        handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
-        _log_to(handler)
-        _listen(runtime.session, lambda pressed: None)
-
-    def starting(self, component: str) -> None:
-        """Print nothing for components that start."""
-
-    def show(self) -> None:
-        """Print a status line at intervals."""
-        self._rates.sample(self._session)
-        if time.monotonic() >= self._next_s:
-            self._next_s += _PLAIN_PERIOD_S
-            line = plain_line(self._session, self._rates)
-            echo(f"{line} | {more}" if (more := self._hooks.line()) else line, err=self._err)
-
-
-class _Panel:
-    """The live panel, and the keys of the runtime: F1..F9 modes, Esc emergency stop, F10 reset."""
-
-    def __init__(self, runtime: Runtime, hooks: RunHooks, stack: ExitStack, *, err: bool) -> None:
-        from rich.live import Live
-
-        from ibrobot_core.screen import Screen
-
-        self._runtime = runtime
-        self._hooks = hooks
-        self._log = RecentLog()
-        self._rates = RecentRates()
-        _log_to(self._log)
-        self._display = stack.enter_context(Live(console=Screen(stderr=err), auto_refresh=False, screen=False))
-        self._next_s = 0.0
-        self._pressed: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
-        """Keys, each with the number of emergency stops when it was pressed."""
-        self._acts: queue.SimpleQueue[tuple[str, Callable[[], object]] | None] = queue.SimpleQueue()
-        self._acting = ""
-        """The name of the present one of `_acts`."""
-        self._thread = threading.Thread(target=self._act_in_turn, name="panel", daemon=True)
-        self._thread.start()
-        stack.callback(self._end)
-        _listen(runtime.session, self._pressed.put)
-
-    def starting(self, component: str) -> None:
-        """Show the component that starts."""
-        self._display.update(f"starting {component} …", refresh=True)
-
-    def show(self) -> None:
-        """Handle pressed keys, and redraw the panel."""
-        if time.monotonic() < self._next_s:
-            return
-        self._next_s = time.monotonic() + 1.0 / _PANEL_HZ
-        while not self._pressed.empty():
-            self._handle_key(*self._pressed.get())
-        session, hooks = self._runtime.session, self._hooks
-        self._rates.sample(session)
-        rows = [*([("now", f"{acting} …")] if (acting := self._acting) else ()), *hooks.rows()]
-        self._display.update(panel(session, self._log, self._rates, hooks.help(), rows), refresh=True)
-
-    def _handle_key(self, key: str, stops: int) -> None:
-        session = self._runtime.session
-        if session.stops > stops:
-            session.log.warning("%s was pressed before the emergency stop, which cancels it", key)
-            return
-        if self._hooks.key(key):
-            return
-        if key == "f10":
-            self._act("resetting", lambda: self._runtime.reset(stops))
-        elif (mode := self._runtime.session.mode_keys.get(key.upper())) is not None:
-            self._act(f"entering mode {mode}", lambda: self._runtime.switch_mode(mode, stops))
-
-    def _act(self, name: str, act: Callable[[], object]) -> None:
-        """Do what may take seconds, e.g. set up a device again, in another thread, while the panel goes on."""
-        if self._runtime.session.request.lockstep:
-            _try(self._runtime.session, act)
-        else:
-            self._acts.put((name, act))
-
-    def _end(self) -> None:
-        self._acts.put(None)
-        self._thread.join(1.0)  # an act that hangs must not keep the run from ending
-
-    def _act_in_turn(self) -> None:
-        while (each := self._acts.get()) is not None:
-            self._acting, act = each
-            try:
-                _try(self._runtime.session, act)
-            except Exception as error:  # noqa: BLE001 - without this thread, the keys of the panel do nothing
-                self._runtime.session.fail(self._acting, error)
-            self._acting = ""
 
 
 def _try(session: Session, act: Callable[[], object]) -> None:

@@ -19,7 +19,7 @@ from ibrobot_core.descriptors import ExecutorDescriptor, TeleopDescriptor, Trans
 from ibrobot_core.options import OptionFault
 from ibrobot_core.plugins import example_type
 from ibrobot_core.robot import Robot
-from ibrobot_core.run_hooks import RUN_KEYS
+from ibrobot_core.run_hooks import RUN_KEYS, check_key
 from ibrobot_core.schema import (
     ControlConfig,
     ControlMode,
@@ -28,7 +28,6 @@ from ibrobot_core.schema import (
     InferenceConfig,
     devices_of,
 )
-from ibrobot_core.terminal import check_key
 
 
 @attrs.frozen

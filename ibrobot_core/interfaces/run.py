@@ -85,7 +85,7 @@ class LaunchRequest:
     goals: tuple[str, ...] = ()
     """Goals for a mode with a planner, in the syntax of `--goal`."""
     keys: Callable[[], Any] | None = None
-    """Subscribes to the keys of the terminal, e.g. `KeyReader.subscribe`."""
+    """Subscribes to the keys of the terminal."""
     prompt: str = ""
     """Prompt of recorded episodes."""
     by_operator: bool = False

@@ -268,7 +268,7 @@ def test_a_hangup_that_the_caller_ignores_stays_ignored(launch: Callable[..., Ra
 
 
 def test_json_is_alone_on_standard_output(launch: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("ibrobot_core.cli.run._PLAIN_PERIOD_S", 0.0)
+    monkeypatch.setattr("ibrobot_core.cli.display._PLAIN_PERIOD_S", 0.0)
     ran = launch(*LOCKSTEP, "--duration", "0.2", "--json")
     assert json.loads(ran.out)["mode"] == "policy"
     assert "mode policy | loop " in ran.err

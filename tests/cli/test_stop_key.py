@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import queue
 import threading
-from contextlib import ExitStack
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from ibrobot_core.cli import run
-from ibrobot_core.run_hooks import RunHooks
+from ibrobot_core.plugins import Registry
 
 
 class Typed(queue.SimpleQueue[str]):
@@ -25,18 +24,26 @@ class Typed(queue.SimpleQueue[str]):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-@pytest.mark.parametrize("view", ["_Lines", "_Panel"])
-def test_esc_stops_in_every_view(view: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    typed, stopped = Typed(), threading.Event()
-    monkeypatch.setattr(run, "_log_to", lambda handler: None)
-    session: Any = SimpleNamespace(
-        request=SimpleNamespace(keys=lambda: typed), pulses=set(), stops=0, emergency_stop=stopped.set
-    )
-    with ExitStack() as stack:
-        getattr(run, view)(SimpleNamespace(session=session), RunHooks(), stack, err=True)
-        for key in ("w", "space", "esc", "end"):
-            typed.put(key)
-        assert stopped.wait(60)
+def test_esc_stops_and_other_keys_reach_the_view_with_the_number_of_stops_before_them() -> None:
+    typed, shown = Typed(), list[tuple[str, int]]()
+    session: Any = SimpleNamespace(request=SimpleNamespace(keys=lambda: typed), pulses=set(), stops=0)
+
+    def stop() -> None:
+        session.stops += 1
+
+    session.emergency_stop = stop
+    run._listen(session, lambda key, stops: shown.append((key, stops)))
+    for key in ("w", "esc", "repeat:esc", "space", "end"):
+        typed.put(key)
     for thread in threading.enumerate():
         if thread.name == "runtime keys":
             thread.join(60)
+    assert session.stops == 1
+    assert shown == [("w", 0), ("repeat:esc", 1), ("space", 1)]
+
+
+def test_without_a_plugin_for_terminals_a_run_warns_that_esc_does_not_stop_it(caplog: pytest.LogCaptureFixture) -> None:
+    nothing: Any = None  # the robot does not matter
+    assert run._terminal(nothing, Registry()) is None
+    assert "Esc does not stop the robot" in caplog.text
+    assert "pip install ibrobot-terminal" in caplog.text

@@ -11,14 +11,12 @@ import attrs
 import numpy as np
 import pytest
 
-from ibrobot_core.cli.run import _listen, _Panel
 from ibrobot_core.control.commands import Command, EmergencyStop, ResetEpisode
 from ibrobot_core.errors import ComponentFailed, HardwareError, NotSupported, TeleopError, TransportError
 from ibrobot_core.launch.runtime import CHECK_ESTOP, ESTOP, RESET, SET_MODE, Runtime
-from ibrobot_core.run_hooks import RunHooks
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from fake_runs import Runs
 
@@ -418,81 +416,3 @@ def assert_braked(commands: list[Any]) -> None:
     np.testing.assert_array_equal(steps[-1], 0.0)
     assert np.abs(np.diff(steps, axis=0)).max() <= 10.0 * 0.02**2 * (1 + 1e-9)
     assert np.abs(commands[-1] - [0.4, 0.2]).max() > 0.05
-
-
-class Typed(queue.SimpleQueue[str]):
-    """Keys; after `end`, the thread that waits for them ends."""
-
-    handled = 0
-    """Number of keys that were handled: the thread has asked for the next one."""
-    _given = False
-
-    def get(self, block: bool = True, timeout: float | None = None) -> str:
-        self.handled += self._given
-        self._given = False
-        key = super().get(block, timeout)
-        self._given = True
-        if key == "end":
-            raise SystemExit
-        return key
-
-
-class Keys:
-    """Keys of a terminal, typed by a test, and the panel that takes them."""
-
-    def __init__(self, run: Runtime) -> None:
-        self.typed = Typed()
-        self.panel = _Panel.__new__(_Panel)
-        self.panel._runtime, self.panel._hooks, self.panel._pressed = run, RunHooks(), queue.SimpleQueue()
-        run.session.request = attrs.evolve(run.session.request, keys=lambda: self.typed)
-        before = set(threading.enumerate())
-        _listen(run.session, self.panel._pressed.put)
-        self.threads = set(threading.enumerate()) - before
-
-    def close(self) -> None:
-        self.typed.put("end")
-        for thread in self.threads:
-            thread.join(PATIENCE_S)
-
-    def press(self, *keys: str) -> None:
-        """Press keys, and wait until they were received."""
-        wanted = self.typed.handled + len(keys)
-        for key in keys:
-            self.typed.put(key)
-        deadline_s = time.monotonic() + PATIENCE_S
-        while self.typed.handled < wanted:
-            assert time.monotonic() < deadline_s
-            time.sleep(0.001)
-
-    def handle(self) -> None:
-        """Handle the pressed keys, as the panel does when it is drawn."""
-        while not self.panel._pressed.empty():
-            self.panel._handle_key(*self.panel._pressed.get())
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # a key that ends the thread
-class TestKeys:
-    @pytest.fixture
-    def keys(self, teleop: Runtime) -> Iterator[Keys]:
-        keys = Keys(teleop)
-        yield keys
-        keys.close()
-
-    def test_pressed_before_escape_do_nothing_after_it(self, teleop: Runtime, keys: Keys, caplog):
-        stop(teleop)
-        keys.press("f10", "f6", "esc")
-        keys.handle()
-        steps(teleop)
-        assert is_stopped(teleop)
-        assert teleop.session.mode == "teleop"
-        assert "f10 was pressed before the emergency stop, which cancels it" in caplog.text
-        keys.press("f10")
-        keys.handle()
-        assert not is_stopped(teleop)
-
-    def test_pressed_before_a_stop_of_another_person_do_nothing_after_it(self, teleop: Runtime, keys: Keys):
-        stop(teleop)
-        keys.press("f10")
-        teleop.session.bus.call(ESTOP, None)
-        keys.handle()
-        assert is_stopped(teleop)

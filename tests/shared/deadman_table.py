@@ -21,6 +21,7 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_feetech.calibration import save_calibration
+from ibrobot_terminal.key_reader import decode as keys_of
 from ibrobot_web import commands as page_commands
 from ibrobot_web.messages import Sent, from_page, from_server, to_run
 from ibrobot_webxr.messages import Hands, decode
@@ -38,7 +39,6 @@ from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Session
 from ibrobot_core.plugins import installed_plugins
-from ibrobot_core.terminal import decode as keys_of
 
 LIMIT_S = 0.3
 _STILL = 2e-5

@@ -8,10 +8,20 @@ from functools import cached_property
 
 import numpy as np
 
-from ibrobot_core.api import Context, JointReading, RealClock, Robot, Teleop, TeleopError, Vector, did_you_mean
+from ibrobot_core.api import (
+    Context,
+    JointReading,
+    NoOptions,
+    RealClock,
+    Robot,
+    Teleop,
+    TeleopError,
+    Vector,
+    did_you_mean,
+)
 from ibrobot_core.app import (
-    KeyReader,
     RobotConfig,
+    RunTerminal,
     begin_operation,
     find_config,
     installed_plugins,
@@ -50,7 +60,7 @@ class ProgramTeleop:
         self._name, self._pose = device, pose
         self._units = use_degrees, calibration
         self._device: Teleop | None = None
-        self._keys: KeyReader | None = None
+        self._keys: RunTerminal | None = None
         self._clock = RealClock()
         self._command: Vector | None = None
         """The last command [rad], shape (J,); None before the first."""
@@ -77,7 +87,7 @@ class ProgramTeleop:
         Raises:
             TeleopError: if it cannot be opened.
         """
-        keys = KeyReader() if sys.stdin.isatty() else None
+        keys = self._terminal() if sys.stdin.isatty() else None
         context = Context.of(self._config, self._name, self._clock, keys=keys.subscribe if keys is not None else None)
         section = self._config.teleoperation[self._name]
         descriptor = installed_plugins().find("teleop", section.type)
@@ -92,6 +102,13 @@ class ProgramTeleop:
                 keys.close()
             raise
         self._device, self._keys, self._command = device, keys, None
+
+    def _terminal(self) -> RunTerminal:
+        """The keys of the terminal."""
+        registry, name = installed_plugins(), "terminal"
+        context = Context.of(self._config, name, self._clock)
+        keys: RunTerminal = registry.create(name, registry.default(name), NoOptions(), context)
+        return keys
 
     def read(self) -> dict[str, float]:
         """The command in LeRobot's units.

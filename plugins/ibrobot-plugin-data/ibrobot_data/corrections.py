@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from typing import override
 
 import attrs
+from ibrobot_terminal import HeldKeys
 
 from ibrobot_core.api import (
-    HeldKeys,
     NotSupported,
     String,
     TeleopCommand,

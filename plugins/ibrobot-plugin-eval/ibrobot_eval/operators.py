@@ -9,8 +9,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import override
 
+from ibrobot_terminal import KeyReader
+
 from ibrobot_core.api import TeleopError
-from ibrobot_core.app import Choice, Event, KeyReader, Sight, echo
+from ibrobot_core.app import Choice, Event, Sight, echo
 from ibrobot_eval.options import Told
 from ibrobot_eval.questions import Questions
 

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from typing import override
 
 import numpy as np
+from ibrobot_terminal import HeldKeys
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
     Approach,
     Context,
     HardwareError,
-    HeldKeys,
     JointReading,
     Teleop,
     TeleopCommand,

@@ -10,8 +10,9 @@ import numpy as np
 import serial
 from ibrobot_kinematics import JogArm, JogMotion, VelocityJog
 from ibrobot_kinematics.rotations import from_rpy, log
+from ibrobot_terminal import HeldKeys
 
-from ibrobot_core.api import Context, HeldKeys, JointReading, Teleop, TeleopCommand, TeleopError, Vector, ns
+from ibrobot_core.api import Context, JointReading, Teleop, TeleopCommand, TeleopError, Vector, ns
 from ibrobot_imu.messages import READERS
 from ibrobot_imu.options import TILTS, TOOL_AXES, ImuOptions
 

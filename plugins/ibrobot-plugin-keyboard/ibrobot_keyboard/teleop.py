@@ -7,12 +7,11 @@ from typing import override
 
 import numpy as np
 from ibrobot_kinematics import JogArm
+from ibrobot_terminal import HeldKeys, KeyEvent
 
 from ibrobot_core.api import (
     Context,
-    HeldKeys,
     JointReading,
-    KeyEvent,
     Teleop,
     TeleopCommand,
     TeleopError,

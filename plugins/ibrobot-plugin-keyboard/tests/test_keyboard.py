@@ -13,10 +13,11 @@ from ibrobot_keyboard import ibrobot_teleop
 from ibrobot_keyboard.keymap import check_keys
 from ibrobot_keyboard.options import KeyboardOptions
 from ibrobot_keyboard.teleop import KeyboardTeleop
+from ibrobot_terminal import KeyReader
 from ibrobot_testing import TeleopSuite, host_context, make_robot
 
 from ibrobot_core.api import Context, Description, Joint, JointReading, Robot, Teleop, TeleopCommand, TeleopError, ns
-from ibrobot_core.app import KeyReader, begin_operation, operate
+from ibrobot_core.app import begin_operation, operate
 
 JOINTS = make_robot().joint_names
 MIDDLE = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])

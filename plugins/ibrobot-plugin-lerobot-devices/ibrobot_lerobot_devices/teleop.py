@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from typing import Any, override
 
 import numpy as np
+from ibrobot_terminal import HeldKeys
 
-from ibrobot_core.api import Approach, Context, HeldKeys, JointReading, Teleop, TeleopCommand, TeleopError, Vector
+from ibrobot_core.api import Approach, Context, JointReading, Teleop, TeleopCommand, TeleopError, Vector
 from ibrobot_lerobot_devices.link import DeviceLink, DeviceProblem, age_ns
 from ibrobot_lerobot_devices.options import TeleopOptions
 from ibrobot_lerobot_devices.units import POSITION, UnitProblem, bases, columns, map_joints

@@ -14,10 +14,10 @@ import tty
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import Any, Self
 
-from ibrobot_core.errors import TeleopError
-from ibrobot_core.keys import RELEASE, REPEAT
+from ibrobot_core.api import TeleopError
+from ibrobot_terminal.held_keys import RELEASE, REPEAT
 
 _ESCAPE_S = 0.05
 """Time after which a lone escape is the key, not the start of a sequence [s]."""
@@ -34,9 +34,6 @@ _NUMBERS = {
     "21": "f10", "23": "f11", "24": "f12",
 }  # fmt: skip
 """First parameter of a sequence that ends with `~` -> key."""
-
-KEY_NAMES = tuple(dict.fromkeys((*_NAMED.values(), "esc", *_LETTERS.values(), *_NUMBERS.values())))
-"""The keys with a name; every other key is the character that it types."""
 
 _ASK, _REPORT_ALL, _REPORT_NO_MORE = b"\x1b[?u", b"\x1b[>27u", b"\x1b[<u"
 """Of kitty's keyboard protocol: ask whether the terminal has it; have it report presses, repeats and releases of all
@@ -63,16 +60,6 @@ _SEQUENCE = re.compile(rb"\x1b(?:\[\[([A-E])|\[([0-?]*)[ -/]*([@-Z\\-~])|O([A-Za
 """An escape sequence: f1 to f5 of the Linux console, a control sequence, or a key in application mode."""
 _BEGINNING = re.compile(rb"\x1b(?:\[(?:\[|[0-?]*[ -/]*)|O)?")
 """An incomplete escape sequence."""
-
-
-def check_key(key: str) -> None:
-    """Check the name of a key.
-
-    Raises:
-        ValueError: if no key has it.
-    """
-    if key not in KEY_NAMES and not (len(key) == 1 and key.isprintable() and key not in _NAMED):
-        raise ValueError(f"{key!r} is not a key: give the character that it types, or a name: {', '.join(KEY_NAMES)}")
 
 
 def decode(typed: bytes, *, final: bool, down: dict[int, str] | None = None) -> tuple[list[str], bytes]:
@@ -252,7 +239,7 @@ class KeyReader:
             self._subscribers.add(subscriber)
         return subscriber
 
-    def __enter__(self) -> KeyReader:
+    def __enter__(self) -> Self:
         self.open()
         return self
 

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 import attrs
 import pyte
 import pytest
+from ibrobot_terminal.panel import RecentLog, panel
 from rich.live import Live
 
-from ibrobot_core.cli.panel import RecentLog, RecentRates, panel, plain_line
-from ibrobot_core.screen import Screen
+from ibrobot_core.app import RunDisplay, Screen
 
 if TYPE_CHECKING:
     from fake_runs import Runs
 
-    from ibrobot_core.launch.runtime import Runtime
+    from ibrobot_core.app import Runtime
 
 SIZES = [(80, 24), (40, 24), (40, 12)]
 FAULT = (
@@ -25,6 +25,13 @@ FAULT = (
     "lists the servos that answer"
 )
 KEYS = "Esc emergency stop F10 reset Ctrl-C end"
+
+
+class Drawn(RunDisplay):
+    """A display that a test draws."""
+
+    def show(self) -> None:
+        """It is drawn by `Terminal`."""
 
 
 @attrs.define
@@ -35,9 +42,12 @@ class Terminal:
     width: int
     height: int
     log: RecentLog = attrs.field(factory=RecentLog)
-    rates: RecentRates = attrs.field(factory=RecentRates)
     help: str = ""
     more: tuple[tuple[str, str], ...] = ()
+    display: Drawn = attrs.field(init=False)
+
+    def __attrs_post_init__(self) -> None:
+        self.display = Drawn(self.run.session)
 
     def lines(self, *messages: str, draws: int = 3) -> list[str]:
         """What is on the screen after some draws over one another."""
@@ -48,8 +58,8 @@ class Terminal:
         with Live(console=console, auto_refresh=False) as live:
             for _ in range(draws):
                 self.run.step()
-                self.rates.sample(self.run.session)
-                live.update(panel(self.run.session, self.log, self.rates, self.help, self.more), refresh=True)
+                self.display.sample()
+                live.update(panel(self.display, self.log, self.help, self.more), refresh=True)
             drawn = sent.getvalue()  # before the display ends, which adds a line
         screen = pyte.Screen(self.width, self.height)
         pyte.Stream(screen).feed(drawn.replace("\n", "\r\n"))
@@ -176,27 +186,3 @@ def test_a_wide_terminal_shows_all_facts(runs: Runs):
         "grip",
     ):
         assert fact in shown, shown
-
-
-def test_rates_are_those_of_the_last_seconds(runs: Runs):
-    runtime = runs.start(mode="teleop")
-    rates = RecentRates()
-
-    def seconds(duration: float) -> None:
-        for _ in range(round(duration * 50)):
-            runtime.step()
-            rates.sample(runtime.session)
-
-    def rate(name: str) -> float:
-        return float(rates[name].removesuffix(" Hz"))
-
-    assert rates["top"] == "- Hz"
-    seconds(10.0)
-    assert rate("top") == pytest.approx(50.0, rel=0.02)
-    runs.parts.MADE["top"].read = lambda timeout_s: None
-    seconds(4.0)
-    assert rate("top") == 0.0
-    assert rate("side") == pytest.approx(50.0, rel=0.02)
-    line = plain_line(runtime.session, rates)
-    assert "top 0.0 Hz" in line
-    assert "loop 50.0 Hz" in line

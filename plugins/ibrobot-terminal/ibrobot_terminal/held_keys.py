@@ -8,7 +8,7 @@ from typing import Literal
 
 import attrs
 
-from ibrobot_core.units import ns
+from ibrobot_core.api import ns
 
 REPEAT, RELEASE = "repeat:", "release:"
 """Prefixes of keys, e.g. `release:space`, from terminals that report these."""

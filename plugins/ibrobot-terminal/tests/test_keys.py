@@ -15,11 +15,10 @@ from collections.abc import Iterator
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from ibrobot_terminal import HeldKeys, KeyReader
+from ibrobot_terminal.key_reader import decode
 
-from ibrobot_core.errors import TeleopError
-from ibrobot_core.keys import HeldKeys
-from ibrobot_core.terminal import KeyReader, decode
-from ibrobot_core.units import ns
+from ibrobot_core.api import TeleopError, ns
 
 TIMEOUT_S = 30
 
