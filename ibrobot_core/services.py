@@ -63,6 +63,8 @@ class Service[Q, A]:
     """Whether it must not wait behind other requests, as an emergency stop."""
     reads: bool = False
     """Whether it changes nothing and moves nothing, so that a request may be answered however late it arrives."""
+    persons: bool = False
+    """Whether it is for persons only: no agent may call it, whatever was granted."""
     ros_type: str = ""
     """The ROS 2 type with the same fields, if there is one, e.g. `ibrobot_msgs/srv/MoveToPose`, or an action."""
     progress: Service[NoRequest, Any] | None = None

@@ -270,6 +270,15 @@ def _vector(
     return ObservationPart(key, topic, type_, selection.paths, None, align, feature, model)
 
 
+def joint_selection(robot: Robot, paths: Sequence[str]) -> Selection:
+    """Reads numbers of a JointState, also those that plugins compute from positions, as `select` names them.
+
+    Raises:
+        ContractError: for a path that leads to no number.
+    """
+    return _selection(JointState.ros_type, paths, _model(robot, paths), robot.joint_names)
+
+
 def _model(robot: Robot, paths: Sequence[str]) -> dict[str, Any]:
     """What the computed numbers among the paths depend on."""
     features = installed_plugins().features

@@ -96,9 +96,16 @@ class ChangeWorld:
     change: Mapping[str, Any]
 
 
+@attrs.frozen
+class LimitSpeed:
+    """Keep all joints to a fraction of their velocity limits from now on; a lower one is refused while they move."""
+
+    fraction: float
+
+
 Command = (
     SwitchMode | ResetEpisode | EmergencyStop | RaiseFault | ClearFaults | SendGoal | CancelGoals | GetCounters | Halt
-    | BeginStartup | ChangeWorld
+    | BeginStartup | ChangeWorld | LimitSpeed
 )  # fmt: skip
 _CLASSES = {kind.__name__: kind for kind in get_args(Command)}
 _RESETTABLE = (Phase.RUNNING, Phase.FAULTED, Phase.SHEDDING, Phase.SHED)

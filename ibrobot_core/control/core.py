@@ -98,6 +98,7 @@ class ControlCore:
             commands.GetCounters: self.counters,
             commands.Halt: self._halt,
             commands.BeginStartup: self.begin_startup,
+            commands.LimitSpeed: self._safety.limit_speed,
             commands.ChangeWorld: lambda change: None if guard is None else guard.world(change),
         }
         """What executes a command, with its fields as arguments."""

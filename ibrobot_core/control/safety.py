@@ -176,6 +176,17 @@ class SafetyLayer:
         """Whether the last command moved no joint, so that a stop is complete."""
         return not self._step.any()
 
+    def limit_speed(self, fraction: float) -> None:
+        """Keep to this fraction of the velocity limits from now on.
+
+        Raises:
+            HardwareError: if it is lower than before, and the joints move.
+        """
+        steps = fraction * (self._highest - 2 * self._half_slack) + self._half_slack
+        if (steps < self._max_step).any() and not self.at_rest:
+            raise HardwareError("the robot moves: wait until it is at rest")
+        self._max_step = steps
+
     def towards(self, target: Vector, speed: float) -> Vector:
         """The desired positions of this tick [rad], shape (J,), for a motion that ends at rest at `target` [rad].
 

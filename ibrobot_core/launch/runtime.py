@@ -45,7 +45,7 @@ class Reset:
 
 SET_MODE = Service("/set_mode", SetMode, NoneType, "Enter another control mode.", alone="mode")
 """The service `/set_mode`."""
-RESET = Service("/reset", Reset, str, "Clear faults and the emergency stop; answers with what the robot does now.")
+RESET = Service("/reset", Reset, str, "Clear faults and stops; answers with what the robot does now.", persons=True)
 """The service `/reset`."""
 ESTOP = Service("/estop", NoRequest, NoneType, "Stop the robot at once, and hold until a reset.", urgent=True)
 """The service `/estop`."""
@@ -253,6 +253,7 @@ class Runtime:
                 raise NotSupported(f"{what}: refused, the run ends")
             if session.stops > stops:
                 raise HardwareError(f"{what}: refused, an emergency stop came after it was requested")
+            session.authority.taken_over(what)
             yield
 
     def _go_on(self) -> None:

@@ -25,6 +25,7 @@ from ibrobot_core.interfaces import Context, JointReading, OperatorEvent, run_st
 from ibrobot_core.interfaces.executor import ExecutorGoal
 from ibrobot_core.interfaces.run import CommandSource, LaunchRequest
 from ibrobot_core.launch.absence import absent_sensors, by_cause
+from ibrobot_core.launch.authority import Authority
 from ibrobot_core.launch.episodes import Episodes
 from ibrobot_core.plugins import Registry
 from ibrobot_core.pulses import Pulse
@@ -68,7 +69,9 @@ class Session:
             `operator`, or `handover` while neither does; empty in other modes.
         followed_ns: when the robot last followed the devices of the present mode [ns]: they command it, and it has
             reached their pose; 0 if it has not.
-        held: whether the robot holds after the reset of a fault, until the operator enters the mode again.
+        held: whether the robot holds after the reset of a fault, or after an agent's authority, until the operator
+            enters the mode again.
+        authority: what agents may do.
         start_failed: whether the run ended before all components had started, so that nothing has moved the robot.
     """
 
@@ -110,6 +113,7 @@ class Session:
         self._control: ControlHost | None = None
         self._commanding = threading.Lock()
         self._new_state = threading.Condition()
+        self.authority = Authority(self)
 
     @cached_property
     def absent(self) -> tuple[run_state.AbsentSensor, ...]:
@@ -203,6 +207,8 @@ class Session:
 
     def send_plan(self, start_ns: int, step_ns: int, joints: tuple[str, ...], positions: Vector) -> None:
         """Send control a plan: positions [rad], shape (N, len(joints)), the first at `start_ns` [ns]."""
+        if not self.authority.admits_plan(joints, positions):
+            return
         robot = self.config.robot
         columns = robot.indices(joints)
         mask = np.zeros(len(robot.joints), dtype=bool)
@@ -231,7 +237,10 @@ class Session:
         generation = self.generation
 
         def send(checked: ExecutorGoal) -> None:
-            self.control.call(commands.SendGoal(executor, goal_id, checked, stops, generation))
+            with self.authority.lock:  # no goal overtakes the end of an agent's authority
+                if self.held:
+                    raise HardwareError(f"refused: holding: {self.to_go_on()}")
+                self.control.call(commands.SendGoal(executor, goal_id, checked, stops, generation))
 
         send(goal) if self.goal_door is None else self.goal_door(executor, goal_id, goal, send)
 
@@ -250,6 +259,33 @@ class Session:
             ComponentFailed: if control has died.
         """
         self.control.call(commands.CancelGoals(executor))
+
+    def hold(self) -> None:
+        """Brake, and hold until somebody enters the mode again; a source that moves by itself ends.
+
+        Raises:
+            ComponentFailed: if control has died.
+        """
+        self._brake()
+        with self.changing:  # another mode may have been entered meanwhile
+            self.held = True
+            if self.command_source.autonomous:
+                self.end_source()
+            self._brake()
+
+    def _brake(self) -> None:
+        """Cancel all goals, and replace the plan by one without joints; what a gripper holds stays held."""
+        self.cancel_goals()
+        none = np.zeros((1, len(self.config.robot.joints)))
+        self.control.write_plan(run_state.PlanRecord(self.generation, self.clock.now_ns(), 1, none[0] > 0, none))
+
+    def limit_speed(self, fraction: float) -> None:
+        """Keep all joints to a fraction of their velocity limits.
+
+        Raises:
+            IbrobotError: if it is lower than before and they move, or control has died.
+        """
+        self.control.call(commands.LimitSpeed(fraction))
 
     def raise_fault(self, fault: str) -> None:
         """Have control brake all joints and hold until a reset.

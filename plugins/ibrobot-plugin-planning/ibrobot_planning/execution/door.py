@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -40,6 +41,8 @@ _AHEAD_S = (0.05, 0.15, 0.4)
 """How far ahead a trajectory takes over from the running one, at each attempt; its check takes a part of the time."""
 _WATCH_S = 0.02
 """Interval at which motions are checked against the present world [s]."""
+_GRANTED_S = 0.01
+"""Interval at which a path is compared with what is granted to an agent [s]."""
 _STILL_RAD = 1e-4
 """Commands that change less in a tick count as at rest."""
 _GLANCE_S = 0.1
@@ -266,7 +269,24 @@ class GoalDoor(SessionWorker):
         if self._is_checked() and (touched := self._paths.blocked(trajectory, self._others(), self._margins())):
             raise PlanningError(f"the trajectory is not free: {touched}", PlanCode.INVALID_MOTION_PLAN)
 
+    def _check_granted(self, trajectory: JointTrajectory) -> None:
+        """Check a trajectory against what is granted to an agent.
+
+        Raises:
+            HardwareError: if it goes beyond that.
+        """
+        motion, robot, authority = motion_of(trajectory), self._robot, self.session.authority
+        if motion is None:  # nobody has completed it
+            authority.check_path(np.empty((0, len(robot.joints))), math.inf)
+            return
+        columns = robot.indices(trajectory.joint_names)
+        positions, velocities, _ = motion.sampled(_GRANTED_S)
+        whole = np.tile([self._others()[name] for name in robot.joint_names], (len(positions), 1))
+        whole[:, columns] = positions
+        authority.check_path(whole, float((np.abs(velocities) / robot.max_velocity[columns]).max()))
+
     def _send(self, executor: str, goal_id: str, goal: FollowTrajectory, send: Send) -> None:
+        self._check_granted(goal.trajectory)
         before, track = self._tracks.get(executor), _Track(goal_id, goal.trajectory)
         self._tracks[executor] = track
         try:

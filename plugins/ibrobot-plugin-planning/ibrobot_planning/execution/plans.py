@@ -203,9 +203,10 @@ class GoalPlans:
             PlanningError: with MoveIt's code.
         """
         goal = without_names(request.goal, self._session.config.robot, request.joints)
+        speed = min(request.velocity_scaling, self._session.authority.speed)
         with self._lock:
             try:
-                return self.planner.plan(attrs.evolve(request, goal=goal))
+                return self.planner.plan(attrs.evolve(request, goal=goal, velocity_scaling=speed))
             except IbrobotError:
                 raise
             except Exception as error:

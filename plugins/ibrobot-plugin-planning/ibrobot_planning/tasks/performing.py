@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextvars
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -96,11 +97,13 @@ class Performance:
         self._stops = stops
         self._held: str | None = None
         """What the gripper holds."""
+        self._context = contextvars.copy_context()
+        """That of whoever begins it, so that what an agent begins is the agent's to the end."""
         self._arm = self._perform()
 
     def advance(self) -> bool:
         """Go on with the steps without waiting; returns whether the task has ended."""
-        return next(self._arm, True) is True
+        return self._context.run(next, self._arm, True) is True
 
     def end(self) -> None:
         """End the present step here, as cancelled."""

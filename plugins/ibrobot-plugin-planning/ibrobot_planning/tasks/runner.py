@@ -33,7 +33,6 @@ class RunTask:
 
 
 _LIMITS = RequestLimits(text=20_000)
-RUN = Service("/task/run", RunTask, int, "Check a task and begin it; answers with its number.", "task", _LIMITS)
 CHECK = Service(
     "/task/check", RunTask, NoneType, "Check a task; fails as /task/run would.", "task", _LIMITS, reads=True
 )
@@ -42,6 +41,9 @@ RESULT: Service[Numbered, TaskResult | None] = Service(
 )
 CANCEL = Service(
     "/task/cancel", NoRequest, NoneType, "End the present task: the robot slows down and holds.", urgent=True
+)
+RUN = Service(
+    "/task/run", RunTask, int, "Check a task and begin it; answers with its number.", "task", _LIMITS, cancel=CANCEL
 )
 STATUS = "/task/status"
 """std_msgs/msg/String, latched: JSON with `task`, `step`, `steps`, `kind`, `name` and `state`."""

@@ -45,7 +45,9 @@ from ibrobot_planning.world.voxels import (
     voxels,
 )
 
-CLEAR = Service("/clear_octomap", NoRequest, NoneType, "Remove the cells of all clouds until the next message.")
+CLEAR = Service(
+    "/clear_octomap", NoRequest, NoneType, "Remove the cells of all clouds until the next message.", persons=True
+)
 """MoveIt's name."""
 _PIXELS = 3
 """Pixels along the edge of a cell at the furthest distance; images are thinned to about this."""

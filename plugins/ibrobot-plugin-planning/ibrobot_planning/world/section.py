@@ -66,12 +66,12 @@ LARGEST_MESH = 4_000_000
 _MESHES = (".stl", ".obj", ".ply")
 _ANSWER = " Answers with the names of all objects."
 ADD = Service("/world/add", Added, list, "Add an object." + _ANSWER)
-REMOVE = Service("/world/remove", Named, list, "Remove an object." + _ANSWER, alone="name")
-MOVE = Service("/world/move", Moved, list, "Move an object." + _ANSWER)
-ATTACH = Service("/world/attach", Attached, list, "Let a link carry an object from now on." + _ANSWER)
+REMOVE = Service("/world/remove", Named, list, "Remove an object." + _ANSWER, alone="name", persons=True)
+MOVE = Service("/world/move", Moved, list, "Move an object." + _ANSWER, persons=True)
+ATTACH = Service("/world/attach", Attached, list, "Let a link carry an object from now on." + _ANSWER, persons=True)
 DETACH = Service("/world/detach", Detached, list, "Put down an object where it is." + _ANSWER)
 TOUCH = Service("/world/touch", Touched, list, "Let the hand touch objects, until the next call." + _ANSWER)
-ALLOW = Service("/world/allow", Allowed, list, "State what an object may touch." + _ANSWER)
+ALLOW = Service("/world/allow", Allowed, list, "State what an object may touch." + _ANSWER, persons=True)
 SHAPES: Service[NoRequest, Sequence[SceneObject]] = Service(
     "/world/shapes", NoRequest, Sequence, "The objects in the base frame that have simple shapes.", reads=True
 )

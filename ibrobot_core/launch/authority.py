@@ -1,0 +1,329 @@
+"""Authority of agents: programs, e.g. language models, that move the robot only within what a person has granted.
+
+A person grants it for a time and a scope. An emergency stop, a fault, a mode switch or reset by anybody else, an
+operator's takeover, silence of the agent, and anybody who wishes end it; the arm then holds until a person goes on.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from contextvars import ContextVar
+from functools import partial
+from types import NoneType
+from typing import TYPE_CHECKING, Any
+
+import attrs
+import numpy as np
+
+from ibrobot_core.contract.specs import joint_selection
+from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported, RequestError
+from ibrobot_core.messages import Header, JointState, String
+from ibrobot_core.options import documented, option
+from ibrobot_core.robot import Vector
+from ibrobot_core.selection import Selection
+from ibrobot_core.services import NoRequest, Plain, Service
+from ibrobot_core.units import ns, seconds
+
+if TYPE_CHECKING:
+    from ibrobot_core.launch.session import Session
+
+AGENT_LOG = "/agent/log"
+"""std_msgs/msg/String: JSON with what agents ask for, who grants it, and how it ends."""
+_MOST_REQUEST = 2_000
+"""Longest request in the log, in characters."""
+_TOLERANCE = 1e-3
+"""How far a number may be outside of the region, in its unit, and a speed above that granted, as a fraction."""
+
+
+@documented
+@attrs.frozen
+class Grant:
+    """A request to `/agent/arm`."""
+
+    seconds: float = option(unit="s", gt=0, le=3600, help="how long the agent may move the robot")
+    services: tuple[str, ...] = option(help="what it may call, beside services that read or stop")
+    speed: float = option(0.25, ge=0.01, le=1, help="fraction of the velocity limits that nothing exceeds meanwhile")
+    region: Mapping[str, tuple[tuple[float, float], ...]] = option(
+        factory=dict, help="path as in `select`, e.g. tool.position -> least and greatest value of each of its numbers"
+    )
+    lease: float = option(10.0, unit="s", ge=0.5, le=120, help="longest silence of the agent's client")
+    agent: str = option("", help="the agent; by default the only one that is connected")
+    by: str = option("", help="who grants it, for the log")
+
+    def __attrs_post_init__(self) -> None:
+        if not all(low < high for low, high in self.bounds):
+            raise ValueError("region: give [least, greatest] for each number")
+
+    @property
+    def bounds(self) -> list[tuple[float, float]]:
+        """Least and greatest value of each number of the region."""
+        return [each for bounds in self.region.values() for each in bounds]
+
+
+@attrs.frozen
+class AgentStatus:
+    """The answer of `/agent/status`."""
+
+    agents: tuple[str, ...]
+    """The connected agents."""
+    ended: str
+    """How the last authority ended; empty before."""
+    armed: str = ""
+    """The agent that may move the robot; empty if there is none."""
+    left_s: float = 0.0
+    """For how long it may do so [s]."""
+    grant: Grant | None = None
+
+
+ARM = Service("/agent/arm", Grant, str, "Let an agent move the robot, for a time and within a scope.", persons=True)
+DISARM = Service("/agent/disarm", NoRequest, NoneType, "End an agent's authority: the arm holds.", urgent=True)
+STATUS = Service("/agent/status", NoRequest, AgentStatus, "Agents, and what they may do.", reads=True)
+
+
+@attrs.define(eq=False)
+class Agent:
+    """A connected agent. Its name is new in each connection, so that nobody inherits what was granted to another."""
+
+    name: str
+    heard_ns: int
+
+
+ACTING: ContextVar[Agent | None] = ContextVar("acting agent", default=None)
+"""The agent for which the present thread works."""
+
+
+@attrs.frozen(eq=False)
+class Scope:
+    """What an agent may do now."""
+
+    agent: Agent
+    grant: Grant
+    until_ns: int
+    numbers: Selection | None
+    """Those of the region; None without one."""
+
+
+class Authority:
+    """What agents may do in a run, and what they did. Doors for agents share that of the session.
+
+    Args:
+        session: the run.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._agents: list[Agent] = []
+        self._scope: Scope | None = None
+        self.lock = threading.RLock()
+        """Held while the scope changes and goals are sent; never while another lock is taken."""
+        self._called: dict[str, Service[Any, Any]] = {}
+        """Services that the agent has called in this scope."""
+        self._left = ""
+        """How a plan would have left the region."""
+        self._numbers = itertools.count(1)
+        self._ended = ""
+        self.speed = 1.0
+        """Fraction of the velocity limits that motions must keep to now."""
+
+    def open(self) -> None:
+        """Serve `/agent/arm`, `/agent/disarm` and `/agent/status`, for a door that calls `check` at least at 20 Hz."""
+        self._session.bus.serve(ARM, self.arm)
+        self._session.bus.serve(DISARM, lambda _: self.end("disarmed"))
+        self._session.bus.serve(STATUS, lambda _: self.status())
+
+    def close(self) -> None:
+        """End the authority, and serve no more."""
+        for service in (ARM, DISARM, STATUS):
+            self._session.bus.unserve(service)
+        self.end("the door for agents closes")
+
+    def join(self, name: str) -> Agent:
+        """Connect an agent, which may then read and stop."""
+        plain = "".join(each for each in name if each.isalnum() or each in "-_.")[:40]
+        agent = Agent(f"{next(self._numbers)}:{plain or 'agent'}", self._session.clock.now_ns())
+        self._agents.append(agent)
+        self._note("joined", agent)
+        return agent
+
+    def leave(self, agent: Agent) -> None:
+        """Disconnect an agent, whose authority ends."""
+        self._agents = [each for each in self._agents if each is not agent]
+        self._note("left", agent)
+        self.check()
+
+    def renew(self, agent: Agent) -> None:
+        """Note a sign of life of the agent's client."""
+        agent.heard_ns = self._session.clock.now_ns()
+
+    def status(self) -> AgentStatus:
+        """What agents may do now."""
+        scope, now_ns = self._scope, self._session.clock.now_ns()
+        armed = () if scope is None else (scope.agent.name, seconds(max(0, scope.until_ns - now_ns)), scope.grant)
+        return AgentStatus(tuple(each.name for each in self._agents), self._ended, *armed)
+
+    def arm(self, grant: Grant) -> str:
+        """Grant authority, in place of what was granted before; answers with what was granted.
+
+        Raises:
+            IbrobotError: if there is no such agent, or the robot is stopped, moves, or is outside of the region.
+        """
+        session = self._session
+        chosen = [each for each in self._agents if grant.agent in ("", each.name)]
+        if len(chosen) != 1:
+            names = ", ".join(self.status().agents) or "none"
+            raise RequestError(f"{ARM.name}: name one agent by `agent`; connected: {names}")
+        if session.faults:
+            raise HardwareError(f"{ARM.name}: refused before a reset: {session.faults[-1]}")
+        with session.changing:
+            self.end("armed anew")
+            if session.held:
+                session.bus.call("/set_mode", session.mode)
+            paths = tuple(grant.region)
+            numbers = joint_selection(session.config.robot, paths) if paths else None
+            if numbers is not None and numbers.size != len(grant.bounds):
+                raise RequestError(f"{ARM.name}: region: {', '.join(paths)} are {numbers.size} numbers")
+            scope = Scope(chosen[0], grant, session.clock.now_ns() + ns(grant.seconds), numbers)
+            if outside := self._outside(scope):
+                raise HardwareError(f"{ARM.name}: the robot is not in the region: {outside}; drive it there first")
+            session.limit_speed(grant.speed)
+            self.renew(scope.agent)
+            self._called, self._left, self.speed, self._scope = {}, "", grant.speed, scope
+        self._note("armed", scope.agent, grant=attrs.asdict(grant))
+        return f"{scope.agent.name} may move the robot for {grant.seconds:g} s at {grant.speed:.0%} of its speed"
+
+    def call(self, agent: Agent, name: str, request: Plain = None) -> Any:
+        """Call a service of the run for an agent.
+
+        Raises:
+            IbrobotError: if the agent may not, or as the service does.
+        """
+        self.renew(agent)
+        service = self._session.bus.services().get(name)
+        facts = {"service": name, "request": json.dumps(request, default=str)[:_MOST_REQUEST]}
+        token = ACTING.set(agent)
+        try:
+            if service is not None and not (service.reads or service.urgent):
+                if service.persons:
+                    raise NotSupported(f"{name} is for persons only: ask one")
+                if name not in (granted := self._granted(agent, name).services):
+                    raise HardwareError(f"{name} is not granted; granted: {', '.join(granted) or 'nothing'}")
+                self._called[name] = service
+            answer = self._session.bus.call(name, request)
+        except Exception as error:
+            self._note("refused", agent, **facts, why=str(error)[:_MOST_REQUEST])
+            raise
+        finally:
+            ACTING.reset(token)
+        if service is None or not service.reads:
+            self._note("called", agent, **facts)
+        return answer
+
+    def _granted(self, agent: Agent, what: str) -> Grant:
+        """What is granted to an agent.
+
+        Raises:
+            HardwareError: if that is nothing, and so `what` is refused.
+        """
+        self.check()
+        scope = self._scope
+        if scope is None or scope.agent is not agent:
+            raise HardwareError(f"{what}: {agent.name} may not move the robot: ask a person to grant it by {ARM.name}")
+        return scope.grant
+
+    def check(self) -> None:
+        """End an authority whose time, lease or conditions are over."""
+        session, scope = self._session, self._scope
+        if scope is None:
+            return
+        now_ns = session.clock.now_ns()
+        if session.faults or session.commander == "operator":  # an emergency stop is a fault
+            self.end((*session.faults, "the operator has taken over")[0], hold=False)
+        elif scope.agent not in self._agents:
+            self.end("the agent is gone")
+        elif now_ns >= scope.until_ns:
+            self.end("its time is over")
+        elif (silent_s := seconds(now_ns - scope.agent.heard_ns)) > scope.grant.lease:
+            self.end(f"the agent's client has been silent for {silent_s:.1f} s")
+        elif why := self._left or self._outside(scope):
+            self.end(f"not within the region: {why}")
+
+    def taken_over(self, what: str) -> None:
+        """Note that the mode is entered or reset, which ends the authority unless its agent does it.
+
+        Raises:
+            HardwareError: if an agent does it that may not.
+        """
+        if (agent := ACTING.get()) is not None:
+            self._granted(agent, what)
+        else:
+            self.end(f"{what} by somebody else", hold=False)
+
+    def end(self, why: str, *, hold: bool = True) -> None:
+        """End the authority, if there is one; the robot then holds until a person goes on, if `hold`."""
+        session = self._session
+        with self.lock:
+            scope, self._scope = self._scope, None
+            if scope is None:
+                return
+            session.held, self.speed, self._ended = session.held or hold, 1.0, why
+        self._note("ended", scope.agent, why=why)
+        acts: list[Callable[[], object]] = [session.hold] if hold else []
+        acts += [partial(session.bus.call, service.cancel) for service in self._called.values() if service.cancel]
+        acts.append(partial(session.limit_speed, 1.0))
+        for act in acts:
+            with suppress(IbrobotError):  # the service is of another mode, or the run ends
+                act()
+
+    def check_path(self, positions: Vector, fastest: float) -> None:
+        """Check the path of a goal of anybody against the present scope.
+
+        Args:
+            positions: of all joints, at short intervals [rad], shape (N, J).
+            fastest: greatest fraction of the velocity limits on it.
+
+        Raises:
+            HardwareError: if it leaves the region, or is too fast.
+        """
+        scope = self._scope
+        if scope is not None and fastest > scope.grant.speed * (1 + _TOLERANCE):
+            raise HardwareError(f"refused: {fastest:.0%} of the speed, {scope.grant.speed:.0%} is granted")
+        if scope is not None and (outside := self._outside(scope, positions)):
+            raise HardwareError(f"refused: the path leaves the region that is granted: {outside}")
+
+    def admits_plan(self, joints: tuple[str, ...], positions: Vector) -> bool:
+        """Whether a plan of anybody stays within the present scope; one that does not ends the authority."""
+        scope, state = self._scope, self._session.state
+        if scope is None or state is None:
+            return not self._session.held
+        rows = np.tile(state.command, (len(positions), 1))
+        rows[:, self._session.config.robot.indices(joints)] = positions
+        self._left = self._left or self._outside(scope, rows)
+        return not self._left
+
+    def _outside(self, scope: Scope, rows: Vector | None = None) -> str:
+        """The first number of the region that positions of all joints exceed, by default the commands; or empty.
+
+        Args:
+            scope: the scope.
+            rows: positions [rad], shape (N, J).
+        """
+        numbers, state, names = scope.numbers, self._session.state, self._session.config.robot.joint_names
+        if numbers is None or state is None:
+            return ""
+        for row in rows if rows is not None else (state.command,):
+            values = numbers(JointState(Header(0), names, row))
+            for name, value, (low, high) in zip(numbers.names, values, scope.grant.bounds, strict=True):
+                if not low - _TOLERANCE <= value <= high + _TOLERANCE:
+                    return f"{name} would be {value:.3f}, granted is {low:g} to {high:g}"
+        return ""
+
+    def _note(self, event: str, agent: Agent, **facts: Any) -> None:
+        """Log an event, on the topic too, which recordings have."""
+        session = self._session
+        entry = {"stamp_ns": session.clock.now_ns(), "event": event, "agent": agent.name, **facts}
+        session.bus.publish(AGENT_LOG, String(json.dumps(entry, default=str)))
+        session.log.info("agent %s: %s", agent.name, " ".join([event, *(f"{k}={v}" for k, v in facts.items())]))

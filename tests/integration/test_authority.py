@@ -1,0 +1,314 @@
+"""What an agent may do in a run: nothing but reading and stopping, unless a person has granted it, and no longer."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ibrobot_core.api import Header, JointState
+from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
+from ibrobot_core.contract.specs import joint_selection
+from ibrobot_core.errors import ContractError, HardwareError, IbrobotError, NotSupported, RequestError, TransportError
+from ibrobot_core.launch.authority import AGENT_LOG, ARM, DISARM, STATUS, Agent, Grant
+
+CONFIG = Path(__file__).parents[2] / "configs" / "so101_blind.yaml"
+GO_TO = "/planning/go_to"
+AWAY, HERE = "shoulder_pan=1.2", "shoulder_pan=0"
+
+
+class AgentRun:
+    """A run in lockstep with an agent, whose client gives signs of life at each tick, unless it is `frozen`."""
+
+    def __init__(self, scene: str = "empty") -> None:
+        overrides = (f"simulation.scene={{type: {scene}}}",)
+        config = load_config(
+            CONFIG, sim=True, mode="moveit_planning", overrides=overrides, registry=installed_plugins()
+        )
+        self.runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True)))
+        self.session = self.runtime.session
+        self.authority = self.session.authority
+        self.commands: list[np.ndarray] = []
+        self.session.on_state.append(lambda state: self.commands.append(state.command.copy()))
+        self.log = self.session.bus.subscribe(AGENT_LOG, 1000)
+        self.frozen = False
+        self.runtime.start()
+        self.authority.open()
+        self.agent = self.authority.join("claude")
+        self.ticks(5)
+
+    def ticks(self, count: int) -> None:
+        for _ in range(count):
+            if not self.frozen:
+                self.authority.renew(self.agent)
+            self.authority.check()
+            self.runtime.step()
+
+    def grant(self, seconds: float = 60.0, services: tuple[str, ...] = (GO_TO,), **more: Any) -> str:
+        answer: str = self.session.bus.call(ARM, Grant(seconds, services, **more))
+        return answer
+
+    def go(self, goal: str = AWAY, agent: Agent | None = None) -> Any:
+        return self.authority.call(agent or self.agent, GO_TO, goal)
+
+    def moved(self, count: int) -> float:
+        """How far the commands move in a number of ticks, of the joint that moves most [rad]."""
+        begun = len(self.commands)
+        self.ticks(count)
+        return float(np.ptp(self.commands[begun - 1 :], axis=0).max())
+
+    def events(self) -> list[dict[str, Any]]:
+        return [json.loads(each.message.data) for each in self.log.drain()]
+
+    def close(self) -> None:
+        self.authority.close()
+        self.runtime.stop()
+
+
+@pytest.fixture
+def run() -> Iterator[AgentRun]:
+    made = AgentRun()
+    yield made
+    made.close()
+
+
+def test_agent_reads_and_stops_without_a_grant(run: AgentRun) -> None:
+    assert run.authority.call(run.agent, "/planning/plan", AWAY).trajectory is not None
+    with pytest.raises(HardwareError, match=r"1:claude may not move the robot: ask a person to grant it by /agent/arm"):
+        run.go()
+    assert run.moved(30) == 0.0
+    run.authority.call(run.agent, "/estop")
+    assert run.session.stops == 1
+
+
+@pytest.mark.parametrize(
+    ("service", "request_"), [("/reset", None), ("/agent/arm", {"seconds": 60, "services": [GO_TO]})]
+)
+def test_services_for_persons_are_refused_whatever_was_granted(run: AgentRun, service: str, request_: Any) -> None:
+    run.grant()
+    with pytest.raises(NotSupported, match=f"{service} is for persons only: ask one"):
+        run.authority.call(run.agent, service, request_)
+    run.session.bus.call(DISARM)
+    run.grant(services=(GO_TO, service))
+    with pytest.raises(NotSupported, match=f"{service} is for persons only: ask one"):
+        run.authority.call(run.agent, service, request_)
+
+
+def test_granted_motion_keeps_to_the_speed(run: AgentRun) -> None:
+    assert run.grant(speed=0.1) == "1:claude may move the robot for 60 s at 10% of its speed"
+    run.go()
+    assert run.moved(600) > 1.0
+    speeds = np.abs(np.diff(run.commands, axis=0)).max(axis=0) * 100.0
+    limits = run.session.config.robot.max_velocity
+    assert (speeds <= 0.1 * limits * 1.002).all()
+    assert speeds.max() > 0.09 * limits.max()
+
+
+def test_service_that_is_not_granted_is_refused(run: AgentRun) -> None:
+    run.grant(services=(GO_TO,))
+    with pytest.raises(HardwareError, match="/move_action is not granted; granted: /planning/go_to"):
+        run.authority.call(run.agent, "/move_action", {"goals": [{"pose": "home"}]})
+    with pytest.raises(HardwareError, match="/set_mode is not granted"):
+        run.authority.call(run.agent, "/set_mode", "model_inference")
+
+
+def end_of_time(run: AgentRun) -> None:
+    run.ticks(60)
+
+
+def silence(run: AgentRun) -> None:
+    run.frozen = True
+    run.ticks(101)
+
+
+def departure(run: AgentRun) -> None:
+    run.authority.leave(run.agent)
+
+
+def disarming(run: AgentRun) -> None:
+    run.session.bus.call(DISARM)
+
+
+@pytest.mark.parametrize(
+    ("ends", "why"),
+    [(end_of_time, "its time is over"), (silence, "silent for"), (departure, "is gone"), (disarming, "disarmed")],
+)
+def test_arm_holds_when_the_authority_ends_in_motion(run: AgentRun, ends: Any, why: str) -> None:
+    run.grant(seconds=0.7 if ends is end_of_time else 60.0, lease=1.0, speed=0.1)
+    run.go()
+    assert run.moved(20) > 0.0
+    ends(run)
+    run.ticks(10)  # it brakes
+    assert run.moved(200) == 0.0
+    assert run.commands[-1][0] < 1.1, "it has not gone on to its goal"
+    assert run.session.held
+    assert why in run.session.bus.call(STATUS).ended
+    assert [each["event"] for each in run.events()][-2:] in (["called", "ended"], ["left", "ended"])
+    with pytest.raises(HardwareError, match="may not move the robot"):
+        run.go()
+
+
+def test_goal_that_was_planned_when_the_authority_ended_does_not_run(run: AgentRun) -> None:
+    run.grant()
+    run.go()
+    run.authority.end("disarmed")
+    assert run.moved(100) == 0.0
+
+
+def test_person_goes_on_by_entering_the_mode_and_is_not_limited(run: AgentRun) -> None:
+    run.grant(speed=0.1)
+    run.go()
+    run.ticks(20)
+    run.session.bus.call(DISARM)
+    run.ticks(20)
+    with pytest.raises(IbrobotError, match="holding"):
+        run.session.send_goal("arm_trajectory", "x", None)  # type: ignore[arg-type]
+    run.session.bus.call("/set_mode", "moveit_planning")
+    run.session.bus.call(GO_TO, AWAY)
+    assert run.moved(200) > 0.9
+    speeds = np.abs(np.diff(run.commands[-200:], axis=0)).max() * 100.0
+    assert speeds > 1.0
+
+
+def test_grant_lets_a_robot_that_holds_go_on(run: AgentRun) -> None:
+    run.grant(seconds=0.3)
+    run.ticks(50)
+    assert run.session.held
+    run.grant()
+    run.go()
+    assert run.moved(400) > 1.0
+
+
+def test_stop_ends_the_authority_and_a_reset_does_not_give_it_back(run: AgentRun) -> None:
+    run.grant()
+    run.go()
+    run.ticks(20)
+    run.session.emergency_stop()
+    run.ticks(40)
+    with pytest.raises(HardwareError, match="refused before a reset"):
+        run.grant()
+    run.runtime.reset()
+    assert run.moved(100) < 1e-3
+    with pytest.raises(HardwareError, match="may not move the robot"):
+        run.go()
+
+
+def test_mode_that_a_person_enters_ends_the_authority(run: AgentRun) -> None:
+    run.grant()
+    run.go()
+    run.ticks(20)
+    run.session.bus.call("/set_mode", "web")
+    assert run.session.bus.call(STATUS).armed == ""
+    assert not run.session.held
+    run.ticks(10)
+    assert run.moved(100) == 0.0
+
+
+def test_agent_enters_modes_that_are_granted(run: AgentRun) -> None:
+    run.grant(services=(GO_TO, "/set_mode"))
+    run.authority.call(run.agent, "/set_mode", "web")
+    run.authority.call(run.agent, "/set_mode", "moveit_planning")
+    run.go()
+    assert run.moved(400) > 1.0
+
+
+def test_grant_is_for_one_connection(run: AgentRun) -> None:
+    second = run.authority.join("claude")
+    with pytest.raises(RequestError, match="name one agent by `agent`; connected: 1:claude, 2:claude"):
+        run.grant()
+    run.grant(agent="1:claude")
+    with pytest.raises(HardwareError, match="2:claude may not move the robot"):
+        run.go(agent=second)
+    run.authority.leave(run.agent)
+    again = run.authority.join("claude")
+    with pytest.raises(HardwareError, match="3:claude may not move the robot"):
+        run.go(agent=again)
+
+
+REGION = {"tool.position": ((0.1, 0.4), (-0.12, 0.12), (0.0, 0.4))}
+
+
+def test_path_that_leaves_the_region_is_refused_though_both_ends_are_within(run: AgentRun) -> None:
+    run.session.bus.call(GO_TO, "shoulder_pan=-0.8")
+    run.ticks(300)
+    tool = joint_selection(run.session.config.robot, ["tool.position"])
+    names = run.session.config.robot.joint_names
+    poses = [np.array([pan, *run.commands[-1][1:]]) for pan in (0.8, 0.0)]
+    side, across = (tool(JointState(Header(0), names, each))[0] for each in poses)
+    run.grant(region={"tool.position": ((-1.0, (side + across) / 2), (-1.0, 1.0), (-1.0, 1.0))})
+    run.go("shoulder_pan=0.8")
+    assert run.moved(300) == 0.0
+    run.go("shoulder_pan=-0.9")
+    assert run.moved(300) > 0.09
+
+
+def policy(run: AgentRun, speed: float = 1.0, **more: Any) -> None:
+    run.grant(services=("/set_mode",), speed=speed, **more)
+    run.authority.call(run.agent, "/set_mode", "model_inference")
+
+
+def test_policy_that_an_agent_begins_ends_with_the_authority() -> None:
+    run = AgentRun(scene="pick_cube")
+    policy(run, speed=0.2)
+    assert run.moved(150) > 0.1
+    speeds = np.abs(np.diff(run.commands, axis=0)).max(axis=0) * 100.0
+    assert (speeds <= 0.2 * run.session.config.robot.max_velocity * 1.001).all()
+    run.frozen = True
+    run.ticks(1050)
+    assert run.moved(200) == 0.0
+    assert run.session.held
+    run.close()
+
+
+def test_policy_that_leaves_the_region_holds_within_it() -> None:
+    run = AgentRun(scene="pick_cube")
+    policy(run, region={"position.shoulder_lift": ((-1.7, -1.2),)})
+    run.ticks(500)
+    assert run.moved(100) == 0.0
+    assert "not within the region: shoulder_lift.pos would be" in run.session.bus.call(STATUS).ended
+    assert np.array(run.commands)[:, 1].max() <= -1.199
+    run.close()
+
+
+def test_goal_out_of_the_region_moves_nothing(run: AgentRun) -> None:
+    run.grant(region=REGION)
+    run.go()
+    assert run.moved(200) == 0.0
+    run.go("shoulder_pan=0.2")
+    assert run.moved(300) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("region", "error", "match"),
+    [
+        ({"tool.nothing": ((0.0, 1.0),)}, ContractError, "the tool has no 'nothing'"),
+        ({"tool.position": ((0.0, 1.0),)}, RequestError, "tool.position are 3 numbers"),
+        ({"tool.position": ((0.9, 1.0),) * 3}, HardwareError, "the robot is not in the region: ee.x would be"),
+        ({"position.shoulder_pan": ((1.0, 1.0),)}, ValueError, r"give \[least, greatest\] for each number"),
+    ],
+)
+def test_regions_that_make_no_sense_are_refused(run: AgentRun, region: Any, error: type[Exception], match: str) -> None:
+    with pytest.raises(error, match=match):
+        run.grant(region=region)
+    assert run.session.bus.call(STATUS).armed == ""
+
+
+def test_log_says_who_granted_and_what_was_asked_for(run: AgentRun) -> None:
+    with pytest.raises(HardwareError):
+        run.go()
+    run.grant(by="Ada")
+    run.go("shoulder_pan=0.1")
+    events = run.events()
+    assert [each["event"] for each in events] == ["joined", "refused", "armed", "called"]
+    assert events[2]["grant"]["by"] == "Ada"
+    assert (events[3]["service"], events[3]["request"]) == (GO_TO, '"shoulder_pan=0.1"')
+    assert [each["agent"] for each in events] == ["1:claude"] * 4
+
+
+def test_unknown_services_are_named(run: AgentRun) -> None:
+    with pytest.raises(TransportError, match="nobody serves /nothing"):
+        run.authority.call(run.agent, "/nothing")
