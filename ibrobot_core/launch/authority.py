@@ -179,7 +179,7 @@ class Authority:
         if session.faults:
             raise HardwareError(f"{ARM.name}: refused before a reset: {session.faults[-1]}")
         with session.changing:
-            self.end("armed anew")
+            self.end("another grant replaces it")
             if session.held:
                 session.bus.call("/set_mode", session.mode)
             paths = tuple(grant.region)
@@ -260,7 +260,7 @@ class Authority:
         if (agent := ACTING.get()) is not None:
             self._granted(agent, what)
         else:
-            self.end(f"{what} by somebody else", hold=False)
+            self.end(f"{what} by another", hold=False)
 
     def end(self, why: str, *, hold: bool = True) -> None:
         """End the authority, if there is one; the robot then holds until a person goes on, if `hold`."""

@@ -261,7 +261,7 @@ class Session:
         self.control.call(commands.CancelGoals(executor))
 
     def hold(self) -> None:
-        """Brake, and hold until somebody enters the mode again; a source that moves by itself ends.
+        """Brake, and hold until a person enters the mode again; a source that moves by itself ends.
 
         Raises:
             ComponentFailed: if control has died.

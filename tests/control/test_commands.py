@@ -32,6 +32,7 @@ TOLERANCES = NUMBERS | st.dictionaries(st.text(), NUMBERS, max_size=3)
 VALUES: dict[Any, st.SearchStrategy[Any]] = {
     str: st.text(),
     int: st.integers(),
+    float: NUMBERS,
     int | None: st.none() | st.integers(),
     bool: st.booleans(),
     Mapping[str, Any]: st.dictionaries(st.text(), JSON, max_size=3),
@@ -57,6 +58,7 @@ VALUES: dict[Any, st.SearchStrategy[Any]] = {
 OTHERS: dict[Any, st.SearchStrategy[Any]] = {
     str: JSON.filter(lambda value: not isinstance(value, str)),
     int: JSON.filter(lambda value: type(value) is not int),
+    float: JSON.filter(lambda value: type(value) not in (int, float)),
     int | None: JSON.filter(lambda value: value is not None and type(value) is not int),
     bool: JSON.filter(lambda value: not isinstance(value, bool)),
     Mapping[str, Any]: JSON.filter(lambda value: not isinstance(value, dict)),

@@ -19,6 +19,7 @@ from ibrobot_core.control.commands import (
     EmergencyStop,
     GetCounters,
     Halt,
+    LimitSpeed,
     RaiseFault,
     ResetEpisode,
     SendGoal,
@@ -314,6 +315,7 @@ COMMANDS: tuple[Command, ...] = (
     Halt(),
     BeginStartup(),
     ChangeWorld({}),
+    LimitSpeed(0.5),
 )
 CAUSES = {
     EmergencyStop: Cause.EMERGENCY_STOP,

@@ -411,6 +411,18 @@ def rest_to_rest(start: float, end: float, velocity: float, acceleration: float,
     return np.append(start + amplitude * (1 - np.cos(omega * time)), end)
 
 
+def test_a_limited_speed_is_kept_and_begins_at_rest() -> None:
+    watched = Watched(one_joint(velocity=4.0, acceleration=20.0), PERIOD_NS)
+    watched.start(ZERO)
+    watched.layer.limit_speed(0.1)
+    steps = np.diff([watched.tick(np.array([1.0]))[0] for _ in range(100)])
+    assert steps.max() == pytest.approx(0.1 * 4.0 * 0.01, rel=1e-6)
+    with pytest.raises(HardwareError, match="the robot moves: wait until it is at rest"):
+        watched.layer.limit_speed(0.05)
+    watched.layer.limit_speed(1.0)
+    assert np.diff([watched.tick(np.array([1.5]))[0] for _ in range(60)]).max() > 0.02
+
+
 @settings(max_examples=40, deadline=None)
 @given(limits, periods, st.floats(0, 1), st.floats(0, 1))
 def test_a_plan_at_the_limits_from_rest_to_rest_passes_unchanged(

@@ -20,6 +20,8 @@ NAMED = {name for row in read_table() for name in row.names}
 KINDS = {"TeleopDescriptor": "teleop", "EngineDescriptor": "engine", "SourceDescriptor": "source"}
 """Kinds of plugins whose types are entrances of their own."""
 STILL_SERVICES = {
+    # What agents may do: they move the robot by the other entrances.
+    "/agent/arm", "/agent/disarm", "/agent/status",
     # Ends motion.
     "/estop", "/estop/check", "/planning/cancel", "/task/cancel", "/web_teleop/release",
     # Episodes: the robot moves as its mode has it, recorded or not.

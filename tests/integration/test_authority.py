@@ -62,7 +62,10 @@ class AgentRun:
         return float(np.ptp(self.commands[begun - 1 :], axis=0).max())
 
     def events(self) -> list[dict[str, Any]]:
-        return [json.loads(each.message.data) for each in self.log.drain()]
+        return [
+            json.loads(each.message.data)  # type: ignore[attr-defined]
+            for each in self.log.drain()
+        ]
 
     def close(self) -> None:
         self.authority.close()

@@ -98,7 +98,7 @@ class Performance:
         self._held: str | None = None
         """What the gripper holds."""
         self._context = contextvars.copy_context()
-        """That of whoever begins it, so that what an agent begins is the agent's to the end."""
+        """That of the caller, so that what an agent begins is its own to the end."""
         self._arm = self._perform()
 
     def advance(self) -> bool:
