@@ -112,10 +112,9 @@ COMMANDS = {
     **dict.fromkeys(
         (
             "camera", "certs", "config", "config copy", "config import", "config new", "config schema", "contract",
-            "convert", "datasets", "datasets check", "datasets info", "description", "doctor", "episodes",
-            "episodes delete", "episodes list",
-            "episodes mark", "episodes repair", "episodes trash", "episodes trim", "explain", "export", "feetech",
-            "gamepad",
+            "convert", "damiao", "datasets", "datasets check", "datasets info", "description", "doctor", "episodes",
+            "episodes delete", "episodes list", "episodes mark", "episodes repair", "episodes trash", "episodes trim",
+            "explain", "export", "feetech", "gamepad",
             "lerobot", "plan", "plugins", "serve", "train",
         ),
         "",

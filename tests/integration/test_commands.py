@@ -73,6 +73,11 @@ WRONG_FILES = {
     "episodes trash BAD": ("folder",),
     "episodes verify BAD": (),
     "export BAD --to onnx": (),
+    "damiao scan ./BAD": (),
+    "damiao scan BAD": (),
+    "damiao off ./BAD --yes": (),
+    "damiao set-id ./BAD 1 2": (),
+    "damiao zero BAD --yes": (),
     "feetech calibrate BAD --yes": (),
     "feetech calibrate no_port --robot BAD --yes": (),
     "feetech check BAD": (),
@@ -113,7 +118,8 @@ WRONG_FILES = {
 """Command line -> the kinds of files that are right there."""
 WITHOUT_FILES = {
     "plugins check",
-    "config schema", "plugins show", "doctor", "camera list", "feetech find-port", "gamepad list",
+    "config schema", "plugins show", "doctor", "camera list", "damiao emulate", "feetech find-port",
+    "gamepad list",
     "gamepad test", "gamepad udev", "lerobot list", "lerobot torque-off", "datasets pull",
 }  # fmt: skip
 KINDS = ("missing", "folder", "binary", "unreadable", "empty")

@@ -1,0 +1,162 @@
+"""The commands on emulated motors behind an slcan adapter, and a run with them."""
+
+from __future__ import annotations
+
+import re
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from click.testing import CliRunner
+from ibrobot_damiao import bus
+from ibrobot_damiao.bus import Channel, DamiaoBus
+from ibrobot_damiao.emulator import EmulatedMotor, EmulatedMotors
+from ibrobot_damiao.emulator.serve import SlcanServer
+from ibrobot_testing.command import command_line
+
+from ibrobot_core.api import HardwareError, IbrobotError
+
+damiao = command_line("damiao")
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy machine may keep the emulator, a thread of this process, from answering for a while."""
+    monkeypatch.setattr(bus, "_ANSWER_S", 0.1)
+
+
+@pytest.fixture
+def adapter() -> Iterator[SlcanServer]:
+    with SlcanServer(EmulatedMotors([EmulatedMotor(motor) for motor in (1, 2, 5)])) as server:
+        yield server
+
+
+def ran(*arguments: str) -> tuple[int, str]:
+    """The exit code, and what is on the screen, with the error that the command line prints."""
+    result = CliRunner().invoke(damiao, arguments)
+    if isinstance(result.exception, IbrobotError):
+        return 1, f"{result.output}error: {result.exception}"
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result.exit_code, result.output
+
+
+def config(folder: Path, channel: str, **changes: Any) -> Path:
+    joints = {"pan": 1, "tilt": 2, "turn": 5}
+    limits = {"lower": -1.0, "upper": 1.0, "max_velocity": 2.0, "max_acceleration": 10.0}
+    motors = {joint: {"id": motor, "kp": 40.0, "kd": 1.5} for joint, motor in joints.items()}
+    robot = {
+        "robot": {
+            "name": "tryout",
+            "joints": [{"name": joint, **limits} for joint in joints],
+            "groups": {"all": [*joints]},
+        },
+        "hardware": {"type": "damiao", "channel": channel, "motors": motors, **changes},
+        "executors": {"joints": {"type": "position", "group": "all"}},
+        "control_modes": {"work": {"executors": ["joints"]}},
+        "default_control_mode": "work",
+    }
+    path = folder / "tryout.yaml"
+    path.write_text(yaml.safe_dump(robot, sort_keys=False))
+    return path
+
+
+def test_scan_lists_the_motors_with_their_state(adapter: SlcanServer) -> None:
+    adapter.motors[2].fail(0xB)
+    code, screen = ran("scan", adapter.channel, "--last", "6")
+    assert code == 0
+    assert [line.split(":")[0] for line in screen.splitlines()] == ["motor 1", "motor 2", "motor 5"]
+    assert "feedback id 0x12, torque over-temperature of the driver" in screen
+
+
+def test_scan_of_an_empty_bus_says_what_to_check(adapter: SlcanServer) -> None:
+    for motor in adapter.motors.motors:
+        motor.silent = True
+    code, screen = ran("scan", adapter.channel, "--last", "2")
+    assert code == 1
+    assert "no motor answers to ids 1 to 2; check the motors' power" in screen
+
+
+@pytest.mark.parametrize(
+    ("channel", "message"),
+    [
+        ("can77", "can77: cannot be opened: .*sudo ip link set can77 up type can bitrate 1000000"),
+        ("/dev/none", "/dev/none: cannot be opened: .*check the adapter's cable"),
+        ("socket://127.0.0.1:{free}", "cannot be opened: .*check the adapter's cable"),
+    ],
+)
+def test_a_channel_that_is_not_there_says_how_to_get_it(channel: str, message: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        free = taken.getsockname()[1]
+    code, screen = ran("scan", channel.format(free=free))
+    assert code == 1
+    assert re.search(message, screen), screen
+
+
+def test_an_unknown_interface_type_names_those_that_are(adapter: SlcanServer) -> None:
+    code, screen = ran("scan", "can0", "--interface", "sockecan")
+    assert code != 0
+    assert "socketcan" in screen
+
+
+def test_off_takes_the_torque_of_those_that_are_there(adapter: SlcanServer) -> None:
+    for motor in adapter.motors.motors:
+        motor.state = 1
+    code, screen = ran("off", adapter.channel, "--id", "1", "--id", "5", "--yes")
+    assert code == 0
+    assert "torque off: motor 1, motor 5" in screen
+    assert [motor.state for motor in adapter.motors.motors] == [0, 1, 0]
+
+
+def test_off_without_an_answer_changes_nothing(adapter: SlcanServer) -> None:
+    adapter.motors[1].state = 1
+    code, screen = ran("off", adapter.channel, "--id", "1")
+    assert code != 0
+    assert "--yes" in screen
+    assert adapter.motors[1].state == 1
+
+
+def test_the_present_pose_becomes_zero(adapter: SlcanServer, tmp_path: Path) -> None:
+    for motor in adapter.motors.motors:
+        motor.angle = 0.1 * motor.id
+    code, screen = ran("zero", str(config(tmp_path, adapter.channel)), "--joint", "pan", "--joint", "turn", "--yes")
+    assert code == 0, screen
+    assert "turn: zero set; it was at 0.500 rad" in screen
+    assert [round(motor.zero, 2) for motor in adapter.motors.motors] == [0.1, 0.0, 0.5]
+
+
+def test_zero_of_an_unknown_joint_or_arm_names_the_known_ones(adapter: SlcanServer, tmp_path: Path) -> None:
+    robot = str(config(tmp_path, adapter.channel))
+    assert "no joint 'pam'; available: pan, tilt, turn" in ran("zero", robot, "--joint", "pam", "--yes")[1]
+    assert "no arm 'left' of type damiao" in ran("zero", robot, "--arm", "left", "--yes")[1]
+    assert not any(motor.zero for motor in adapter.motors.motors)
+
+
+def test_a_motor_gets_an_id_that_it_keeps(adapter: SlcanServer) -> None:
+    code, screen = ran("set-id", adapter.channel, "5", "3")
+    assert code == 0, screen
+    motor = adapter.motors[3]
+    motor.restart()
+    assert (motor.id, motor.registers[7]) == (3, 0x13)
+    assert "motor 5 is motor 3, with feedback id 0x13" in screen
+
+
+def test_an_id_that_is_taken_is_refused(adapter: SlcanServer) -> None:
+    code, screen = ran("set-id", adapter.channel, "5", "2")
+    assert code != 0
+    assert "a motor has id 2 already" in screen
+    assert [motor.id for motor in adapter.motors.motors] == [1, 2, 5]
+
+
+def test_a_pulled_cable_ends_a_request_with_what_to_check(adapter: SlcanServer) -> None:
+    opened = DamiaoBus(Channel(adapter.channel))
+    opened.open()
+    try:
+        opened.find(1)
+        adapter.unplug()
+        with pytest.raises(HardwareError, match=r"(has failed|does not take a frame|does not answer).*check"):
+            opened.ask(1)
+    finally:
+        opened.close()

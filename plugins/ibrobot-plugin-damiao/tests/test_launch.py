@@ -1,0 +1,64 @@
+"""The robot of the how-to on emulated motors: it runs, is recorded, and a motor that fails is named."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+from ibrobot_damiao.emulator import EmulatedMotor, EmulatedMotors
+from ibrobot_damiao.emulator.serve import SlcanServer
+from ibrobot_testing import ibrobot_command
+
+pytestmark = pytest.mark.integration
+PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "drive-a-can-arm.md"
+JOINTS = 8
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Path:
+    """The YAML of the page, with a policy that moves each joint to another position."""
+    (text,) = re.findall(r"```yaml\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    policy = "models: {wave: {type: fake}}\n"
+    mode = "control_modes:\n  wave: {executors: [arm, gripper], inference: {model: wave}}\n"
+    path = tmp_path / "openarm.yaml"
+    path.write_text(policy + text.replace("control_modes:\n", mode))
+    return path
+
+
+def launched(robot: Path, adapter: SlcanServer, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """A run of some seconds; a busy machine may keep the emulator, a thread of this process, from answering."""
+    patient = ("--set", "hardware.lost_replies=1000", "--set", "control.state_timeout=60")
+    return subprocess.run(
+        [*ibrobot_command(), "launch", str(robot), "--mode", "wave", "--headless", *patient, *arguments],
+        env={**os.environ, "IBROBOT_CAN": adapter.channel},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=robot.parent,
+        check=False,
+    )
+
+
+def test_a_policy_moves_the_arm_and_the_end_says_how_to_take_the_torque_off(robot: Path) -> None:
+    motors = EmulatedMotors(EmulatedMotor(motor) for motor in range(1, JOINTS + 1))
+    with SlcanServer(motors) as adapter:
+        ended = launched(robot, adapter, "--duration", "3", "--json")
+    assert ended.returncode == 0, ended.stderr
+    assert json.loads(ended.stdout)["faults"] == []
+    assert sum(abs(motor.angle) > 0.05 for motor in motors.motors) >= JOINTS // 2
+    assert all(motor.state == 1 for motor in motors.motors)
+    assert re.search(r"ibrobot damiao off socket://127.0.0.1:\d+ --id 1 .*--id 8", ended.stderr)
+
+
+def test_a_hot_motor_stops_the_arm_and_is_named(robot: Path) -> None:
+    motors = EmulatedMotors(EmulatedMotor(motor) for motor in range(1, JOINTS + 1))
+    motors[4].coil = 100.0
+    with SlcanServer(motors) as adapter:
+        ended = launched(robot, adapter, "--duration", "2", "--json")
+    faults = json.loads(ended.stdout)["faults"]
+    assert "motor 4 (joint4): temperature 100 deg C, above max_temperature (90 deg C)" in str(faults)
+    assert all(abs(motor.angle) < 0.1 for motor in motors.motors)
