@@ -6,8 +6,6 @@ from ibrobot_core.descriptors import (
     SectionDescriptor as SectionDescriptor,
     Kind as Kind,
     SourceDescriptor as SourceDescriptor,
-    PanelDescriptor as PanelDescriptor,
-    GuideDescriptor as GuideDescriptor,
     ConfigFile as ConfigFile,
     FeatureDescriptor as FeatureDescriptor,
 )
@@ -154,16 +152,10 @@ from ibrobot_core.events import (
     Shown as Shown,
     decode_event as decode_event,
 )
-from ibrobot_core.events import Ask as Ask, Choice as Choice, Sight as Sight, Answer as Answer
 from ibrobot_core.safe_output import echo as echo, confirm as confirm, prompt as prompt, LogFormatter as LogFormatter
 from ibrobot_core.screen import Screen as Screen, styled as styled
 from ibrobot_core.cli.display import RunDisplay as RunDisplay, RunTerminal as RunTerminal
 from ibrobot_core.signals import on_signals as on_signals, end_signals as end_signals
-
-# Jobs
-
-# Guides
-from ibrobot_core.interfaces import Guide as Guide, Question as Question
 
 # Processes
 from ibrobot_core.channel import Channel as Channel, ChannelMessage as ChannelMessage

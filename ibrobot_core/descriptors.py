@@ -347,31 +347,6 @@ class FeatureDescriptor:
 
 
 @attrs.frozen
-class PanelDescriptor:
-    """A table about a run, for viewers, e.g. temperatures."""
-
-    title: str
-    columns: tuple[str, ...]
-    """The heads of the columns; the first column names the rows."""
-    rows: Callable[[RunView], Sequence[Sequence[str]]]
-    """Returns the present rows with one text for each column; none for a run that the panel does not concern. Called a
-    few times per second, in a thread of the host."""
-
-
-@attrs.frozen
-class GuideDescriptor:
-    """Work at a device in which an operator takes part, for pages, e.g. a calibration."""
-
-    name: str
-    title: str
-    summary: str
-    run: Callable[[Mapping[str, str | bool], interfaces.Guide], None]
-    """Does the work in a process of its own, with the answers to the questions by name."""
-    questions: Callable[[], Sequence[interfaces.Question]] = lambda: ()
-    """Returns the questions that are asked first, e.g. for the port, with what is plugged in as choices."""
-
-
-@attrs.frozen
 class ConfigFile:
     """A robot YAML that a plugin ships; `ibrobot launch NAME` finds it."""
 

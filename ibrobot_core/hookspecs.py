@@ -105,16 +105,6 @@ def ibrobot_sections() -> Iterable[descriptors.SectionDescriptor]:  # type: igno
 
 
 @hookspec
-def ibrobot_panels() -> Iterable[descriptors.PanelDescriptor]:  # type: ignore[empty-body]
-    """Tables about a run that viewers show."""
-
-
-@hookspec
-def ibrobot_guides() -> Iterable[descriptors.GuideDescriptor]:  # type: ignore[empty-body]
-    """Work at devices in which an operator takes part, for pages."""
-
-
-@hookspec
 def ibrobot_kinds() -> Iterable[descriptors.Kind]:  # type: ignore[empty-body]
     """Kinds that this plugin defines, each with a hook by which others offer theirs."""
 

@@ -52,7 +52,7 @@ KINDS: Mapping[str, str] = {
     "section": "ibrobot_sections",
 }
 """Plugin kind -> its registration hook."""
-_UNTYPED = tuple(f"ibrobot_{name}s" for name in ("reader", "decoder", "feature", "config", "command", "panel", "guide"))
+_UNTYPED = tuple(f"ibrobot_{name}s" for name in ("reader", "decoder", "feature", "config", "command"))
 """Registration hooks for objects that the YAML does not name by `type`."""
 
 OFFICIAL = Path(__file__).with_name("official_plugins.json")
@@ -105,8 +105,6 @@ class Registry:
     failures: list[Failure] = attrs.field(factory=list)
     configs: list[descriptors.ConfigFile] = attrs.field(factory=list)
     readers: list[descriptors.ReaderDescriptor] = attrs.field(factory=list)
-    panels: list[descriptors.PanelDescriptor] = attrs.field(factory=list)
-    guides: list[descriptors.GuideDescriptor] = attrs.field(factory=list)
     decoders: list[descriptors.DecoderDescriptor] = attrs.field(factory=list)
     features: dict[str, descriptors.FeatureDescriptor] = attrs.field(factory=dict)
     kinds: dict[str, descriptors.Kind] = attrs.field(factory=dict)
@@ -438,7 +436,7 @@ class _Plugin:
                 entry = Entry(name, each, self.name, self.package, self.version)
                 if (other := registry.entries.setdefault((name, each.type), entry)) is not entry:
                     self.double(registry, name, each.type, other.package, hook)
-        for name in ("readers", "decoders", "configs", "panels", "guides"):
+        for name in ("readers", "decoders", "configs"):
             getattr(registry, name).extend(offers[f"ibrobot_{name}"])
         for each in offers["ibrobot_commands"]:
             if registry.commands.setdefault(each.name, each) is each:

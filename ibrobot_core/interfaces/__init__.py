@@ -5,7 +5,6 @@ from ibrobot_core.interfaces.engine import Engine, EngineStats
 from ibrobot_core.interfaces.executor import Executor, GoalState, GoalStatus, Plan
 from ibrobot_core.interfaces.feature import Feature
 from ibrobot_core.interfaces.guard import Guard
-from ibrobot_core.interfaces.guide import Guide, Question
 from ibrobot_core.interfaces.hardware import (
     EpisodeSetup,
     Hardware,

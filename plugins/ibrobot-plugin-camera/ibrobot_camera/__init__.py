@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
+from ibrobot_terminal import GuideDescriptor
+
 from ibrobot_camera.device import realsense_stream, require_device, video_device
 from ibrobot_camera.options import OpenCvOptions, RealSenseOptions, picture_size
 from ibrobot_core.api import Check, DecoderDescriptor, Late, OptionFault, SensorDescriptor, SensorError, hookimpl
-from ibrobot_core.app import Command, GuideDescriptor
+from ibrobot_core.app import Command
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
@@ -71,23 +73,23 @@ def ibrobot_commands() -> Iterable[Command]:
     yield Command("camera calibrate", Late("ibrobot_camera.commands.calibrate:CalibrateCamera"))
 
 
-@hookimpl
+@hookimpl(optionalhook=True)
 def ibrobot_guides() -> Iterable[GuideDescriptor]:
     """The cameras, with pictures."""
     summary = "List the cameras, with their formats and a picture of each."
     yield GuideDescriptor(
         "cameras",
-        "Cameras",
-        summary,
-        Late("ibrobot_camera.guides:show_cameras"),
-        Late("ibrobot_camera.guides:camera_questions"),
+        label="Cameras",
+        summary=summary,
+        make=Late("ibrobot_camera.guides:show_cameras"),
+        questions=Late("ibrobot_camera.guides:camera_questions"),
     )
     yield GuideDescriptor(
         "lens",
-        "Calibrate a camera",
-        "Measure the lens of a camera with a printed board; `ibrobot camera board` makes the page to print.",
-        Late("ibrobot_camera.commands.calibrate:guided"),
-        Late("ibrobot_camera.commands.calibrate:questions"),
+        label="Calibrate a camera",
+        summary="Measure the lens of a camera with a printed board; `ibrobot camera board` makes the page to print.",
+        make=Late("ibrobot_camera.commands.calibrate:guided"),
+        questions=Late("ibrobot_camera.commands.calibrate:questions"),
     )
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from ibrobot_terminal import Guide, Question
+
 from ibrobot_camera import v4l2
 from ibrobot_camera.commands.sources import browser_jpeg, opened
 from ibrobot_core.api import SensorError
-from ibrobot_core.app import Guide, Question
 
 _WAIT_S = 5.0
 _ALL = "all"

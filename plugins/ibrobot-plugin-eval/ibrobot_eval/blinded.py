@@ -18,18 +18,10 @@ from typing import override
 
 import attrs
 import numpy as np
+from ibrobot_provenance.asking import Choice
 
 from ibrobot_core.api import IbrobotError, seconds
-from ibrobot_core.app import (
-    Choice,
-    LaunchRequest,
-    LogFormatter,
-    Runtime,
-    Session,
-    end_signals,
-    error_line,
-    installed_plugins,
-)
+from ibrobot_core.app import LaunchRequest, LogFormatter, Runtime, Session, end_signals, error_line, installed_plugins
 from ibrobot_eval.cameras import StartPictures, cameras_of, live_pictures
 from ibrobot_eval.comparison import Decision
 from ibrobot_eval.episodes import SCRATCH, Result, interventions, recorded_in

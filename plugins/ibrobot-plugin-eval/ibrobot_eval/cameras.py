@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
+from ibrobot_provenance.asking import Sight
 from ibrobot_ros2.jpeg import fits_jpeg, is_jpeg, to_jpeg
 
 from ibrobot_core.api import CompressedImage, Context, IbrobotError, Image, Message, RealClock, Sensor
-from ibrobot_core.app import Bus, RobotConfig, Sight, Subscription, installed_plugins
+from ibrobot_core.app import Bus, RobotConfig, Subscription, installed_plugins
 from ibrobot_eval.episodes import write
 
 _QUALITY = 85

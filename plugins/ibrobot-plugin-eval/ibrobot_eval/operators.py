@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import override
 
+from ibrobot_provenance.asking import Choice, Sight
 from ibrobot_terminal import KeyReader
 
 from ibrobot_core.api import TeleopError
-from ibrobot_core.app import Choice, Event, Sight, echo
+from ibrobot_core.app import Event, echo
 from ibrobot_eval.options import Told
 from ibrobot_eval.questions import Questions
 

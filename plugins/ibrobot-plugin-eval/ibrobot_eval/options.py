@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import override
 
 import attrs
+from ibrobot_provenance.asking import Ask
 from ibrobot_provenance.work_options import on_option, shard_of, shard_option
 
 from ibrobot_core.api import option
-from ibrobot_core.app import Ask, Event, Shown
+from ibrobot_core.app import Event, Shown
 
 SETTINGS = "evaluation.json"
 """File in the folder of an evaluation with its settings."""

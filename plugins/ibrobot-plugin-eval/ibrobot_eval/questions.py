@@ -9,7 +9,9 @@ import time
 from collections.abc import Sequence
 from types import NoneType
 
-from ibrobot_core.app import Answer, Ask, Choice, ComponentFailed, RequestError, Service, Sight, WireError
+from ibrobot_provenance.asking import Answer, Ask, Choice, Sight
+
+from ibrobot_core.app import ComponentFailed, RequestError, Service, WireError
 
 _ANSWER = Service("answer", Answer, NoneType)
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import pytest
 from ibrobot_eval.questions import Questions
+from ibrobot_provenance.asking import Choice
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import Choice
 
 YES = Choice(key="y", text="yes")
 

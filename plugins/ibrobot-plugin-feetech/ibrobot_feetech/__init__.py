@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from ibrobot_terminal import GuideDescriptor, PanelDescriptor
+
 from ibrobot_core.api import Check, HardwareDescriptor, Late, SensorDescriptor, TeleopDescriptor, hookimpl
-from ibrobot_core.app import Command, GuideDescriptor, PanelDescriptor
+from ibrobot_core.app import Command
 from ibrobot_feetech.options import (
     TOOL,
     EmulatedSignalOptions,
@@ -18,49 +20,53 @@ from ibrobot_feetech.options import (
 )
 
 
-@hookimpl
+@hookimpl(optionalhook=True)
 def ibrobot_panels() -> Iterable[PanelDescriptor]:
     """State of the servos."""
     yield PanelDescriptor(
-        "Servos", ("servo", "temperature", "voltage", "current", "load"), Late("ibrobot_feetech.panel:servo_rows")
+        "servos",
+        label="Servos",
+        summary="state of each servo",
+        columns=("servo", "temperature", "voltage", "current", "load"),
+        make=Late("ibrobot_feetech.panel:servo_rows"),
     )
 
 
-@hookimpl
+@hookimpl(optionalhook=True)
 def ibrobot_guides() -> Iterable[GuideDescriptor]:
     """Ports, motors and calibration."""
     yield GuideDescriptor(
         "ports",
-        "Serial ports",
-        "List the USB serial ports, and which are adapters of an SO-101.",
-        Late("ibrobot_feetech.guides:list_all"),
+        label="Serial ports",
+        summary="List the USB serial ports, and which are adapters of an SO-101.",
+        make=Late("ibrobot_feetech.guides:list_all"),
     )
     yield GuideDescriptor(
         "port",
-        "Find an arm's port",
-        "Unplug the arm and plug it in again to find its port.",
-        Late("ibrobot_feetech.guides:find"),
+        label="Find an arm's port",
+        summary="Unplug the arm and plug it in again to find its port.",
+        make=Late("ibrobot_feetech.guides:find"),
     )
     yield GuideDescriptor(
         "motors",
-        "Set up motors",
-        "Give each servo its id and 1 Mbaud, with one servo connected at a time.",
-        Late("ibrobot_feetech.guides:set_up"),
-        Late("ibrobot_feetech.guides:setup_questions"),
+        label="Set up motors",
+        summary="Give each servo its id and 1 Mbaud, with one servo connected at a time.",
+        make=Late("ibrobot_feetech.guides:set_up"),
+        questions=Late("ibrobot_feetech.guides:setup_questions"),
     )
     yield GuideDescriptor(
         "calibration",
-        "Calibrate an arm",
-        "Measure the middle pose and the range of each joint, moved by hand.",
-        Late("ibrobot_feetech.guides:calibrate"),
-        Late("ibrobot_feetech.guides:calibration_questions"),
+        label="Calibrate an arm",
+        summary="Measure the middle pose and the range of each joint, moved by hand.",
+        make=Late("ibrobot_feetech.guides:calibrate"),
+        questions=Late("ibrobot_feetech.guides:calibration_questions"),
     )
     yield GuideDescriptor(
         "servos",
-        "Check an arm",
-        "Compare the servos with their calibration.",
-        Late("ibrobot_feetech.guides:check"),
-        Late("ibrobot_feetech.guides:check_questions"),
+        label="Check an arm",
+        summary="Compare the servos with their calibration.",
+        make=Late("ibrobot_feetech.guides:check"),
+        questions=Late("ibrobot_feetech.guides:check_questions"),
     )
 
 

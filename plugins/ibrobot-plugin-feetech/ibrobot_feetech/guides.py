@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from ibrobot_terminal import Guide, Question
+
 from ibrobot_core.api import HardwareError
-from ibrobot_core.app import Guide, Question
 from ibrobot_feetech.calibration import ZERO_AT
 from ibrobot_feetech.commands.calibrate import calibrate_arm
 from ibrobot_feetech.commands.check import check_arm

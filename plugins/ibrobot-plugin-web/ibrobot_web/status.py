@@ -142,13 +142,13 @@ def _jogs(session: RunView) -> list[str]:
 def _panels(session: RunView) -> list[dict[str, Any]]:
     """The tables of plugins; the error of one takes the place of its rows."""
     panels = []
-    for panel in session.registry.panels:
+    for panel in session.registry.of_kind("panel"):
         try:
-            rows = [[str(cell) for cell in row] for row in panel.rows(session)]
+            rows = [[str(cell) for cell in row] for row in panel.make(session)]
         except Exception as error:  # noqa: BLE001 - contained: a plugin's table must not end the run
             rows = [[error_text(error)]]
         if rows:
-            panels.append({"title": panel.title, "columns": list(panel.columns), "rows": rows})
+            panels.append({"title": panel.label, "columns": list(panel.columns), "rows": rows})
     return panels
 
 

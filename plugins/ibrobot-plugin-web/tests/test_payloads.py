@@ -15,6 +15,7 @@ import simplejpeg
 from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_ros2.jpeg import to_jpeg
+from ibrobot_terminal import PanelDescriptor
 from ibrobot_testing import make_session, stand_in
 from ibrobot_web.link import JPEG, PICTURE_HEAD, FrameSender
 from ibrobot_web.objects import SceneObjects
@@ -34,7 +35,7 @@ from ibrobot_core.api import (
     String,
     Vector3,
 )
-from ibrobot_core.app import Channel, PanelDescriptor, RunView
+from ibrobot_core.app import Channel, RunView
 
 
 def gradient(encoding: str) -> Image:
@@ -147,18 +148,21 @@ def test_pages_that_only_watch_see_no_token_in_the_log() -> None:
     assert line["text"] == "viewer: http://127.0.0.1:8080/?token=…  (to watch only: http://127.0.0.1:8080/?token=…)"
 
 
-def test_panels_of_plugins_are_shown_and_a_failing_one_harms_nothing() -> None:
+def test_panels_of_plugins_are_shown_and_a_failing_one_harms_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(session: RunView) -> list[list[str]]:
         raise ValueError("no servos")
 
     session = make_session()
-    session.registry.panels += [
-        PanelDescriptor(
-            "Joints", ("joint",), lambda session: [[name] for name in session.config.robot.joint_names[:2]]
-        ),
-        PanelDescriptor("Nothing here", ("joint",), lambda session: []),
-        PanelDescriptor("Broken", ("servo",), fails),
+
+    def panel(title: str, head: str, rows: Any) -> PanelDescriptor:
+        return PanelDescriptor(title.lower(), label=title, summary="", columns=(head,), make=rows)
+
+    panels = [
+        panel("Joints", "joint", lambda session: [[name] for name in session.config.robot.joint_names[:2]]),
+        panel("Nothing_here", "joint", lambda session: []),
+        panel("Broken", "servo", fails),
     ]
+    monkeypatch.setattr(type(session.registry), "of_kind", lambda self, kind: panels)
     joints, broken = status_json(session, LogLines(), 0)["panels"]
     assert joints == {"title": "Joints", "columns": ["joint"], "rows": [["shoulder_pan"], ["shoulder_lift"]]}
     assert "no servos" in broken["rows"][0][0]

@@ -10,6 +10,7 @@ from typing import Any, override
 
 import attrs
 import pytest
+from ibrobot_provenance.asking import Ask
 from ibrobot_testing.command import command_line
 from ibrobot_web.ui import forms
 from ibrobot_web.ui.context import Ui
@@ -19,7 +20,7 @@ from ibrobot_web.ui.job_runner import Jobs
 from ibrobot_web.ui.jobs import answer, event_reader, sight
 
 from ibrobot_core.api import IbrobotError, MissingDependency, option
-from ibrobot_core.app import Ask, Command, Event, Registry, Shown
+from ibrobot_core.app import Command, Event, Registry, Shown
 from ibrobot_core.events import encode_event
 
 
@@ -180,7 +181,8 @@ class Asking:
 
     PROGRAM = """
 import json, sys
-from ibrobot_core.events import Ask, Choice, Sight, encode_event
+from ibrobot_core.events import encode_event
+from ibrobot_provenance.asking import Ask, Choice, Sight
 sight = Sight(camera="top", wanted="a.jpg", live="../b.jpg")
 yes_or_no = (Choice(key="y", text="yes"), Choice(key="n", text="no"))
 for number, text, choices in ((1, "go on?", yes_or_no), (2, "why?", ())):

@@ -8,10 +8,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from ibrobot_terminal import GuideDescriptor, Question
+from ibrobot_web.ui import robots
 from ibrobot_web.ui.job_runner import IBROBOT
 from ui_server import UiServer, run_ui
-
-from ibrobot_core.app import GuideDescriptor, Question, installed_plugins
 
 ROBOT = """# A pan axis: it turns a camera.
 robot:
@@ -173,9 +173,13 @@ def test_links_out_of_the_folder_are_not_followed(folder: Path, tmp_path_factory
 def test_a_bundled_robot_is_copied_with_ports_of_what_was_found(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     port = "/dev/serial/by-id/usb-arm"
     guide = GuideDescriptor(
-        "port", "Port", "", lambda answers, guide: None, lambda: (Question("port", "", "", (port,)),)
+        "port",
+        label="Port",
+        summary="",
+        make=lambda answers, guide: None,
+        questions=lambda: (Question("port", "", "", (port,)),),
     )
-    monkeypatch.setattr(type(installed_plugins()), "guides", (guide,))
+    monkeypatch.setattr(robots, "installed_guides", lambda: [guide])
 
     async def test(server: UiServer) -> None:
         offered = await server.get("robots/copying", robot="so101")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from ibrobot_terminal import PanelDescriptor
+
 from ibrobot_core.api import DecoderDescriptor, Late, TransportDescriptor, hookimpl
-from ibrobot_core.app import Command, PanelDescriptor
+from ibrobot_core.app import Command
 from ibrobot_zenoh.options import Share, ZenohOptions, check_files, server_options
 
 
@@ -36,11 +38,15 @@ def _subscribed(options: ZenohOptions) -> list[tuple[tuple[str | int, ...], str]
     return [(("share", "subscribe", key), topic) for key, topic in zip(keys, topics, strict=True)]
 
 
-@hookimpl
+@hookimpl(optionalhook=True)
 def ibrobot_panels() -> Iterable[PanelDescriptor]:
     """The machines that a run is connected to."""
     yield PanelDescriptor(
-        "Zenoh peers", ("peer", "kind", "address", "certificate"), Late("ibrobot_zenoh.panel:peer_rows")
+        "zenoh_peers",
+        label="Zenoh peers",
+        summary="the machines that a run is connected to",
+        columns=("peer", "kind", "address", "certificate"),
+        make=Late("ibrobot_zenoh.panel:peer_rows"),
     )
 
 

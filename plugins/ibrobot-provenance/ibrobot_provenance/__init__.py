@@ -1,1 +1,1 @@
-"""Jobs and pools (`jobs`), the code that results depend on (`code`), and folders with one owner (`ownership`)."""
+"""Jobs and pools, their questions, the code that results depend on, and folders with one owner."""

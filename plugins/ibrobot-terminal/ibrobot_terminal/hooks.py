@@ -1,4 +1,4 @@
-"""The hook: the terminal of runs."""
+"""The hooks: the terminal of runs, and the kinds of guides and of tables about a run."""
 
 from __future__ import annotations
 
@@ -6,6 +6,15 @@ from collections.abc import Iterable
 from typing import Any
 
 from ibrobot_core.api import Descriptor, Late, hookimpl
+from ibrobot_core.app import Kind
+from ibrobot_terminal.guide import GuideDescriptor, PanelDescriptor
+
+
+@hookimpl
+def ibrobot_kinds() -> Iterable[Kind]:
+    """Guides for operators, and tables about a run."""
+    yield Kind("guide", "ibrobot_guides", GuideDescriptor)
+    yield Kind("panel", "ibrobot_panels", PanelDescriptor)
 
 
 @hookimpl

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 
 from ibrobot_core import hookimpl
 from ibrobot_core.descriptors import (
@@ -12,9 +11,7 @@ from ibrobot_core.descriptors import (
     ConfigFile,
     DecoderDescriptor,
     FeatureDescriptor,
-    GuideDescriptor,
     HardwareDescriptor,
-    PanelDescriptor,
     ReaderDescriptor,
     SensorDescriptor,
 )
@@ -56,8 +53,6 @@ WITHOUT_NAME: Mapping[str, Callable[[], object]] = {
     "ibrobot_features": lambda: FeatureDescriptor(3, _nothing, _nothing, _nothing),  # type: ignore[arg-type]
     "ibrobot_configs": lambda: ConfigFile("x", "robot.yaml"),  # type: ignore[arg-type]
     "ibrobot_commands": lambda: Command(3),  # type: ignore[arg-type]
-    "ibrobot_panels": lambda: PanelDescriptor(3, (), _nothing),  # type: ignore[arg-type]
-    "ibrobot_guides": lambda: GuideDescriptor("x", Path("x"), "x", _nothing),  # type: ignore[arg-type]
     "ibrobot_doctor": lambda: Check("x", True, 3),  # type: ignore[arg-type]
 }
 

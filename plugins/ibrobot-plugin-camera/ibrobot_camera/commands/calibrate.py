@@ -10,13 +10,14 @@ from pathlib import Path
 import attrs
 import cv2
 import numpy as np
+from ibrobot_terminal import Guide, Question
 from numpy.typing import NDArray
 
 from ibrobot_camera.intrinsics.board import PAPERS, Board
 from ibrobot_camera.intrinsics.solve import FEWEST_VIEWS, Intrinsics, solve
 from ibrobot_camera.intrinsics.views import View, Views, find
 from ibrobot_core.api import SensorError, option
-from ibrobot_core.app import Guide, Question, RequestError, echo, wrong_input
+from ibrobot_core.app import RequestError, echo, wrong_input
 
 VIEWS = 20
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp")

@@ -9,12 +9,12 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import override
 
-from ibrobot_terminal import KeyReader
+from ibrobot_terminal import Guide, KeyReader
 from rich.box import SIMPLE_HEAD
 from rich.live import Live
 from rich.table import Table
 
-from ibrobot_core.app import Guide, RequestError, Screen, confirm, echo, prompt
+from ibrobot_core.app import RequestError, Screen, confirm, echo, prompt
 
 _PERIOD_S = 0.03
 """Time between two updates of a table [s]."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import attrs
+from ibrobot_terminal import Guide
 
 from ibrobot_core.api import HardwareError, option
-from ibrobot_core.app import Guide
 from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.usb import UsbPort, usb_ports
 

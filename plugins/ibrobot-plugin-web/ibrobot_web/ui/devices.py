@@ -7,15 +7,15 @@ from collections.abc import Mapping
 from typing import Any
 
 import attrs
+from ibrobot_terminal import Question
+from ibrobot_terminal.guide import installed_guides
 
 from ibrobot_core.api import IbrobotError, option
 from ibrobot_core.app import (
     ChannelMessage,
     Child,
     ComponentFailed,
-    Question,
     install_command,
-    installed_plugins,
     official_plugins,
 )
 from ibrobot_web.pictures import Picture
@@ -117,12 +117,12 @@ def listing(ui: Ui) -> dict[str, Any]:
     """The guides of all plugins, with their questions, and the command that installs others if there are none."""
     guides = [
         {
-            "name": guide.name,
-            "title": guide.title,
+            "name": guide.type,
+            "title": guide.label,
             "summary": guide.summary,
             "questions": [attrs.asdict(question) for question in guide.questions()],
         }
-        for guide in installed_plugins().guides
+        for guide in installed_guides()
     ]
     others = [package for package, offers in official_plugins().items() if "guide" in offers]
     return {"guides": guides, "install": "" if guides else install_command(others)}
@@ -130,7 +130,7 @@ def listing(ui: Ui) -> dict[str, Any]:
 
 def start(ui: Ui, name: str, answers: Mapping[str, str | bool] = option(factory=dict)) -> dict[str, int]:
     """Start a guide, with the answers to its questions, by their names."""
-    guide = next((each for each in installed_plugins().guides if each.name == name), None)
+    guide = next((each for each in installed_guides() if each.type == name), None)
     if guide is None:
         raise IbrobotError(f"no guide {name!r}")
     given = {each.name: _answer(each, answers) for each in guide.questions()}
@@ -140,8 +140,8 @@ def start(ui: Ui, name: str, answers: Mapping[str, str | bool] = option(factory=
         if before is not None and before.state == "running":
             raise IbrobotError(f"{before.title} is running: end it first")
         number = before.number + 1 if before is not None else 1
-        order = {"name": guide.name, "answers": given}
-        work = Work(guide.name, guide.title, number, Child(_MODULE, order, end_s=_END_S))
+        order = {"name": guide.type, "answers": given}
+        work = Work(guide.type, guide.label, number, Child(_MODULE, order, end_s=_END_S))
         work.thread = threading.Thread(target=_follow, args=(devices.lock, work), name="guide", daemon=True)
         work.thread.start()
         devices.work = work

@@ -14,8 +14,11 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, override
 
+from ibrobot_terminal import Guide
+from ibrobot_terminal.guide import installed_guides
+
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import Channel, Guide, installed_plugins, run_child
+from ibrobot_core.app import Channel, run_child
 
 _POLL_S = 0.03
 _ROWS_S = 0.1
@@ -87,9 +90,9 @@ class PageGuide(Guide):
 
 def run(channel: Channel, order: Mapping[str, Any]) -> None:
     """Run the guide."""
-    guide = next(each for each in installed_plugins().guides if each.name == order["name"])
+    guide = next(each for each in installed_guides() if each.type == order["name"])
     try:
-        guide.run(order["answers"], PageGuide(channel))
+        guide.make(order["answers"], PageGuide(channel))
     except Exception as error:
         if not isinstance(error, IbrobotError):
             logging.getLogger("ibrobot.ui").exception("the guide %s failed", order["name"])

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import attrs
+from ibrobot_provenance.asking import Answer
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import Answer
 from ibrobot_web.status import without_tokens
 
 IBROBOT = (sys.executable, "-c", "from ibrobot_core.cli.command import main; main()")

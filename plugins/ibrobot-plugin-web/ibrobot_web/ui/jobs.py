@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_provenance.asking import Answer, Ask
 
 from ibrobot_core.api import IbrobotError, option
-from ibrobot_core.app import Answer, Ask, Command, Failed, WireError, decode_event, installed_plugins
+from ibrobot_core.app import Command, Failed, WireError, decode_event, installed_plugins
 from ibrobot_web.pictures import Picture
 from ibrobot_web.ui.context import Routes, Ui
 from ibrobot_web.ui.folders import Folders

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from ibrobot_terminal.guide import installed_guides
+
 from ibrobot_core.api import IbrobotError, option
 from ibrobot_core.app import (
     ConfigError,
@@ -164,7 +166,7 @@ def copying(ui: Ui, robot: str) -> dict[str, Any]:
     """
     source = find_config(robot_of(ui, robot), installed_plugins())
     variables: dict[str, tuple[str, ...]] = {}
-    for guide in installed_plugins().guides:
+    for guide in installed_guides():
         for question in guide.questions():
             variables.setdefault(question.name, tuple(each for each in question.choices if "/" in each))
     return {

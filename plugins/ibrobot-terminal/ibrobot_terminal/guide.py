@@ -1,11 +1,18 @@
-"""Guides, which lead an operator through work at a device, in a terminal or on a page."""
+"""What an operator sees: guides through work at a device, in a terminal or on a page, and tables about a run."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import attrs
+
+from ibrobot_core.api import Descriptor
+from ibrobot_core.app import installed_plugins
+
+if TYPE_CHECKING:
+    from ibrobot_core.app import RunView
 
 Cells = Sequence[Sequence[str]]
 
@@ -64,3 +71,29 @@ class Guide(ABC):
 
     def picture(self, title: str, content: bytes) -> None:
         """Show a JPEG or PNG, where pictures can be shown."""
+
+
+@attrs.frozen
+class GuideDescriptor(Descriptor[Any]):
+    """Work at a device in which an operator takes part, for pages, e.g. a calibration. Its `label` is its title."""
+
+    make: Callable[[Mapping[str, str | bool], Guide], None] = attrs.field(kw_only=True)  # type: ignore[assignment]
+    """Does the work in a process of its own, with the answers to the questions by name."""
+    questions: Callable[[], Sequence[Question]] = attrs.field(default=lambda: (), kw_only=True)
+    """Returns the questions that are asked first, e.g. for the port, with what is plugged in as choices."""
+
+
+def installed_guides() -> list[GuideDescriptor]:
+    """The guides of all plugins."""
+    return [each for each in installed_plugins().of_kind("guide") if isinstance(each, GuideDescriptor)]
+
+
+@attrs.frozen
+class PanelDescriptor(Descriptor[Any]):
+    """A table about a run, for viewers, e.g. temperatures. Its `label` is its title."""
+
+    make: Callable[[RunView], Cells] = attrs.field(kw_only=True)  # type: ignore[assignment]
+    """Returns the present rows with one text for each column; none for a run that the panel does not concern. Called a
+    few times per second, in a thread of the host."""
+    columns: tuple[str, ...] = attrs.field(kw_only=True)
+    """The heads of the columns; the first column names the rows."""
