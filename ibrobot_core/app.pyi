@@ -6,6 +6,7 @@ from ibrobot_core.descriptors import (
     SectionDescriptor as SectionDescriptor,
     Kind as Kind,
     SourceDescriptor as SourceDescriptor,
+    TerminalDescriptor as TerminalDescriptor,
     ConfigFile as ConfigFile,
     FeatureDescriptor as FeatureDescriptor,
 )

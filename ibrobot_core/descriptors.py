@@ -264,6 +264,11 @@ class ViewerDescriptor(Descriptor["interfaces.Viewer"]):
 
 
 @attrs.frozen
+class TerminalDescriptor(Descriptor[Any]):
+    """What reads the keys of a terminal and shows runs in it: `make` gives a `RunTerminal`."""
+
+
+@attrs.frozen
 class SectionDescriptor(Descriptor["Component"]):
     """A section that a plugin adds to the robot YAML, e.g. `counter: {topic: /count}`, and its component.
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
-from ibrobot_core.api import Descriptor, Late, hookimpl
-from ibrobot_core.app import Kind
+from ibrobot_core.api import Late, hookimpl
+from ibrobot_core.app import Kind, TerminalDescriptor
 from ibrobot_terminal.guide import GuideDescriptor, PanelDescriptor
 
 
@@ -18,9 +17,9 @@ def ibrobot_kinds() -> Iterable[Kind]:
 
 
 @hookimpl
-def ibrobot_terminals() -> Iterable[Descriptor[Any]]:
+def ibrobot_terminals() -> Iterable[TerminalDescriptor]:
     """Keys and panel."""
-    yield Descriptor(
+    yield TerminalDescriptor(
         type="panel",
         make=lambda options, ctx: Late("ibrobot_terminal.run_terminal:PanelTerminal")(),
         summary="reads the terminal's keys, and shows a live panel",
