@@ -10,17 +10,19 @@ from pathlib import Path
 
 from ibrobot_provenance.reports import ReportDescriptor
 
-from ibrobot_core.api import Late, hookimpl
+from ibrobot_core.api import Descriptor, Late, hookimpl
 from ibrobot_core.app import Command, Kind
-from ibrobot_diagnose.cause import KIND, CauseDescriptor
-from ibrobot_diagnose.options import CHECK_EVENTS, EVENTS, REPORT
+from ibrobot_diagnose.cause import ARM_VIEW, DEVICE_POSE, KIND, CauseDescriptor
+from ibrobot_diagnose.options import CHECK_EVENTS, EVENTS, PREFLIGHT_EVENTS, REPORT
 from ibrobot_diagnose.options import KIND as REPORT_KIND
 
 
 @hookimpl
 def ibrobot_kinds() -> Iterable[Kind]:
-    """Causes."""
+    """Causes; what draws the arm in a camera, and what tells where a teleoperation device stands."""
     yield Kind(KIND, "ibrobot_causes", CauseDescriptor)
+    yield Kind(ARM_VIEW, "ibrobot_arm_views", Descriptor)
+    yield Kind(DEVICE_POSE, "ibrobot_device_poses", Descriptor)
 
 
 @hookimpl
@@ -30,6 +32,8 @@ def ibrobot_commands() -> Iterable[Command]:
     yield Command("datasets card", Late("ibrobot_diagnose.commands.card:MakeCard"))
     check = Late("ibrobot_diagnose.commands.check:CheckDataset")
     yield Command("datasets check", check, "Check each episode of a dataset.", CHECK_EVENTS)
+    preflight = Late("ibrobot_diagnose.commands.preflight:Preflight")
+    yield Command("preflight", preflight, "Say whether a rig is what it was.", PREFLIGHT_EVENTS)
     yield Command("explain", Late("ibrobot_diagnose.commands.explain:Explain"), summary, EVENTS)
 
 

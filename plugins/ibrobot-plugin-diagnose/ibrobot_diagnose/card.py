@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Contract, DatasetError, replace_file
+from ibrobot_diagnose.alignment import shift_of
 from ibrobot_diagnose.course import delay_of
-from ibrobot_diagnose.pictures import SMALL, Grey, background, descriptors, grey, nearest, png, read_png, shift_of
+from ibrobot_diagnose.pictures import SMALL, Grey, background, descriptors, grey, nearest, png, read_png
+from ibrobot_diagnose.rig import Rig, rig_of
 from ibrobot_diagnose.window import Camera, Floats, Window
 
 FILE = "reference.json"
@@ -105,6 +107,8 @@ class Card:
     """What `ibrobot train` did: policy, steps; None if the card is not of a training."""
     statistics: Mapping[str, Any] | None = None
     """Mean and deviation of state and action in the unit of the training; None if unknown."""
+    rig: Rig | None = None
+    """The rig at its last episode, or when it was taken; None if it is unknown."""
 
     def quantile(self, name: str, level: float) -> float:
         """A quantile over the episodes, of `series`."""
@@ -131,6 +135,7 @@ class Card:
             "ages_ms": dict(self.ages_ms), "norm_mode": self.norm_mode, "trained": self.trained,
             "statistics": self.statistics,
             "cameras": {key: _camera_facts(each) for key, each in self.cameras.items()},
+            "rig": None if self.rig is None else self.rig.facts(),
         }  # fmt: skip
 
     @classmethod
@@ -171,6 +176,7 @@ class Card:
             ages_ms={str(name): _finite(each, name) for name, each in facts["ages_ms"].items()},
             cameras={str(key): _read_camera(each, len(joints)) for key, each in facts["cameras"].items()},
             norm_mode=facts["norm_mode"], trained=facts["trained"], statistics=facts["statistics"],
+            rig=None if facts.get("rig") is None else Rig.of(facts["rig"]),  # cards of before have none
         )  # fmt: skip
 
 
@@ -359,6 +365,7 @@ class Maker:
         self._series: dict[str, list[float]] = {}
         self._ages: dict[str, list[float]] = {}
         self._cameras: dict[str, _CameraMaker] = {}
+        self._rig: Rig | None = None
 
     def add(self, window: Window) -> None:
         """Add an episode.
@@ -386,6 +393,7 @@ class Maker:
         self._tables["ends"].append(states[-1:])
         self._tables["ways"].append(way_of(window)[None])
         self._prompts[window.prompt] += 1
+        self._rig = window.rig or rig_of(window) or self._rig
         for name, value in series_of(window).items():
             self._series.setdefault(name, []).append(value)
         if not window.sampled and len(window.state.times_ns):
@@ -414,6 +422,7 @@ class Maker:
         for name, tables in other._tables.items():
             self._tables[name] += tables
         self._prompts += other._prompts
+        self._rig = other._rig or self._rig
         self._rests += other._rests
         for own, theirs in ((self._series, other._series), (self._ages, other._ages)):
             for name, values in theirs.items():
@@ -445,7 +454,7 @@ class Maker:
             contract.rate_hz, joints, contract.canonical(), len(joined["starts"]),
             len(joined["state"]), dict(self._prompts), **quantiles, **poses, following=tuple(following), series=series,
             ages_ms={name: float(np.median(each)) for name, each in self._ages.items()},
-            cameras={key: each.card() for key, each in self._cameras.items()}, **more,
+            cameras={key: each.card() for key, each in self._cameras.items()}, rig=self._rig, **more,
         )  # fmt: skip
 
 

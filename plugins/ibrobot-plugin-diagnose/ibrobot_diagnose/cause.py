@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, ClassVar, override
+from typing import TYPE_CHECKING, ClassVar, Literal, override
 
 import attrs
 
@@ -22,8 +22,23 @@ if TYPE_CHECKING:
 
 KIND = "cause"
 """The kind of plugin, with the hook `ibrobot_causes`."""
+ARM_VIEW = "arm_view"
+"""The kind of what draws the arm in a camera, with the hook `ibrobot_arm_views`; see `arm_view.ArmView`.
+
+Its `make` takes a `RobotConfig`, the name of a camera's peripheral, its `CameraInfo` or None, and height and width of
+the pictures [pixels]. It returns an `ArmView`, or raises an `IbrobotError` that says what is missing.
+"""
+DEVICE_POSE = "device_pose"
+"""The kind of what tells where a teleoperation device stands, by the type of the device; hook `ibrobot_device_poses`.
+
+Its `make` takes the options of the device and a context with the part of the robot that it moves. It returns joint of
+the robot -> position [rad], or raises an `IbrobotError`.
+"""
 ACCUSED = 0.5
 """Likelihood from which a cause is named."""
+_FAILED = 0.85
+"""Likelihood from which a rig fails, for causes that state no number for it."""
+type Verdict = Literal["ok", "warn", "fail", "cannot tell"]
 
 
 @attrs.frozen(eq=False)
@@ -56,6 +71,20 @@ class Evidence:
     follows: frozenset[str] = frozenset()
     """Names of further causes that bring this about."""
     pictures: tuple[Shown, ...] = ()
+    fails: float | None = None
+    """The number from which a rig is not fit to be used; None if the likelihood says it."""
+    unclear: str = ""
+    """Why it cannot be told; empty if it can."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """What it says of a rig."""
+        if self.unclear:
+            return "cannot tell"
+        if self.likelihood < ACCUSED:
+            return "ok"
+        failed = self.likelihood >= _FAILED if self.fails is None else self.number >= self.fails
+        return "fail" if failed else "warn"
 
 
 @attrs.frozen(eq=False)
@@ -74,6 +103,7 @@ class Reference:
         has = {
             "card": card is not None, "card pictures": card is not None and bool(card.cameras),
             "training card": card is not None and card.trained is not None, "model": self.model is not None,
+            "rig card": card is not None and card.rig is not None,
         }  # fmt: skip
         return frozenset(name for name, there in has.items() if there)
 
@@ -90,7 +120,8 @@ class Cause(ABC):
     """The condition in which nothing is wrong, for the list of what is healthy, e.g. `cameras stand as in training`."""
     needs: ClassVar[frozenset[str]] = frozenset()
     """The streams of the window and the reference that it needs: `state`, `commands`, `answers`, `chunks` (used ones),
-    `pictures`, `guard`, `outcome`, `demonstration`; `card`, `card pictures`, `training card`; `model`."""
+    `pictures`, `guard`, `outcome`, `demonstration`, `motion`, `rig` (at rest); `card`, `card pictures`, `rig card`,
+    `training card`; `model`."""
     explains: ClassVar[frozenset[str]] = frozenset()
     """Names of causes that this one brings about: those are consequences if this one is found."""
     weak: ClassVar[bool] = False
@@ -168,6 +199,8 @@ class Diagnosis:
     """Name and title of the causes that were tested and not accused."""
     untested: tuple[tuple[str, str], ...]
     """Name of the causes that could not be tested, and why."""
+    measured: tuple[Finding, ...] = ()
+    """The evidence of healthy causes, as far as there is any."""
 
     @property
     def first(self) -> str:
@@ -181,6 +214,8 @@ _LACKS = {
     "pictures": "no pictures were recorded", "guard": "the robot had no guard", "outcome": "nobody judged the outcome",
     "card": "there is no card of the model's data: --data",
     "card pictures": "there is no card of the model's pictures: --data",
+    "motion": "the arm stands still", "rig": "this is no rig at rest",
+    "rig card": "there is no reference of the rig: `ibrobot preflight --take`",
     "training card": "there is no card from a training", "model": "the model was not asked: --model",
 }  # fmt: skip
 
@@ -237,10 +272,10 @@ def diagnose(
     """
     there = window.streams | reference.streams
     findings: list[Finding] = []
-    healthy, untested = [], []
+    healthy, untested, measured = [], [], []
     for cause in installed_causes() if causes is None else causes:
-        if "demonstration" in cause.needs and "demonstration" not in there:
-            continue
+        if (cause.needs - there) & {"demonstration", "motion", "rig"}:
+            continue  # it is about another kind of window
         if lacking := sorted(cause.needs - there):
             untested.append((cause.name, _LACKS.get(lacking[0], lacking[0])))
             continue
@@ -249,8 +284,10 @@ def diagnose(
             findings.append(Finding(cause, evidence))
         else:
             healthy.append((cause.name, cause.title))
+            if evidence is not None:
+                measured.append(Finding(cause, evidence))
         tested(cause.name)
-    return Diagnosis(ranked(findings), tuple(healthy), tuple(untested))
+    return Diagnosis(ranked(findings), tuple(healthy), tuple(untested), tuple(measured))
 
 
 def ranked(findings: Sequence[Finding]) -> tuple[Finding, ...]:

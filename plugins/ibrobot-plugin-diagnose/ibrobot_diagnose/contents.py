@@ -15,6 +15,7 @@ from ibrobot_provenance.reports import Case, Cases, Plots, ReportSection, Table,
 from ibrobot_provenance.svg import axis_of, caption, grid_below, grid_beside, svg, tag
 
 from ibrobot_core.api import DatasetError, replace_file
+from ibrobot_diagnose.cause import Finding, Shown
 from ibrobot_diagnose.options import REPORT
 from ibrobot_diagnose.pictures import png
 from ibrobot_diagnose.report import Explanation
@@ -158,6 +159,10 @@ def _pictures(explanation: Explanation) -> str:
     shown = [each for finding in explanation.diagnosis.findings for each in finding.evidence.pictures]
     if explanation.reference.model is not None:
         shown += explanation.reference.model.looks
+    return _figures(shown)
+
+
+def _figures(shown: Sequence[Shown]) -> str:
     shown = list({each.title: each for each in shown}.values())
     if not shown:
         return ""
@@ -187,3 +192,29 @@ def _players(explanation: Explanation) -> str:
     return (
         tag("h2", "What the cameras saw") + tag("div", "".join(players), class_="panels") + _PLAYER if players else ""
     )
+
+
+def write_preflight(out: Path, facts: Mapping[str, Any], findings: Sequence[Finding]) -> None:
+    """Write the comparison of a rig as JSON and as one HTML file into a folder."""
+    out.mkdir(parents=True, exist_ok=True)
+    rows = tuple(
+        (
+            each["verdict"], each["name"], each["text"], f"{each['number']:.3g} {each['unit']}",
+            f"{each['threshold']:.3g}", "" if each["fails"] is None else f"{each['fails']:.3g}",
+        )
+        for each in facts["lines"]
+    )  # fmt: skip
+    blocks: list[Text | Table | Plots | Cases] = [Text(facts["first"], "verdict")]
+    for each in facts["lines"]:
+        if each["verdict"] in ("fail", "warn"):
+            blocks += [Text(each["text"], "title"), *(Text(detail, "note") for detail in each["details"])]
+            blocks.append(Text(f"What to do: {each['remedy']}"))
+    table = Table(("verdict", "what", "how it is", "number", "warns from", "fails from"), rows)
+    sections = [ReportSection(facts["robot"], tuple(blocks)), ReportSection("What was compared", (table,))]
+    if untested := tuple((each["name"], each["why"]) for each in facts["untested"]):
+        sections.append(ReportSection(f"Not tested ({len(untested)})", (Table(("cause", "why"), untested),)))
+    if facts["notes"]:
+        sections.append(ReportSection("Notes", tuple(Text(note) for note in facts["notes"])))
+    shown = [each for finding in findings for each in finding.evidence.pictures]
+    replace_file(out / "report.html", as_page(out, facts["first"], sections, more=_figures(shown)))
+    replace_file(out / "preflight.json", json.dumps(facts) + "\n")

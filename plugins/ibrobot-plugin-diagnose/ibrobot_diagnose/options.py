@@ -126,3 +126,48 @@ class CheckReport(Event):
 
 
 CHECK_EVENTS = (CheckProgress, CheckReport)
+
+
+@attrs.frozen(kw_only=True)
+class PreflightOptions:
+    """Which rig is looked at, and what it is compared with."""
+
+    robot: str | None = option(None, typed="ROBOT", names="robot", label="Robot", help="robot YAML")
+    against: Path | None = option(
+        None, names="dataset", label="Against",
+        help="the reference: one that was taken, or a dataset or checkpoint with its card",
+    )  # fmt: skip
+    take: Path | None = option(None, typed="--take FILE", label="Take", help="write a reference to this file")
+    sim: bool = option(False, label="Simulated", help="use the simulation section instead of hardware")
+    mode: str | None = option(None, typed="--mode MODE", label=None, help="in place of default_control_mode")
+    seconds: float = option(3.0, ge=0.5, le=60, unit="s", label="Duration", more=True, help="length of the window")
+    lockstep: bool = option(False, label=None, help="look in simulated time; the loop's rate is then not measured")
+    overrides: tuple[str, ...] = option((), typed="--set PATH=VALUE", label=None, help="e.g. control.rate_hz=50")
+    out: Path | None = option(None, label="Folder", help="folder for a report as HTML and JSON")
+
+
+@attrs.frozen(kw_only=True)
+class Looking(Event):
+    """The rig is looked at."""
+
+    what: str = option(help="what begins now")
+
+    @override
+    def shown(self) -> Shown:
+        return Shown(self.what)
+
+
+@attrs.frozen(kw_only=True)
+class PreflightReport(Event):
+    """The result."""
+
+    verdict: str = option(help="ok, warn or fail")
+    lines: tuple[str, ...] = option(help="a line for each thing compared, worst first")
+    out: str = option("", help="folder of the report; empty without one")
+
+    @override
+    def shown(self) -> Shown:
+        return Shown(self.lines[-1] if self.lines else self.verdict, 1.0)
+
+
+PREFLIGHT_EVENTS = (Looking, PreflightReport)

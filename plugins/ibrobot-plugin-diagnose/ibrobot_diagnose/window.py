@@ -26,6 +26,7 @@ from ibrobot_core.api import (
     pixels,
 )
 from ibrobot_diagnose.pictures import SMALL, Picture, shrink, small_of
+from ibrobot_diagnose.rig import STILL_WIDTH, Rig
 
 type Floats = NDArray[np.float64]
 type Times = NDArray[np.int64]
@@ -37,6 +38,8 @@ COMPARED = 60
 """Pictures of each camera that are compared with the data."""
 KEPT = 48
 """Pictures of each camera that are kept in a larger size, evenly over the window."""
+_STILLS = 3
+"""Pictures of each camera that are kept in a still larger size."""
 
 
 @attrs.frozen(eq=False)
@@ -117,6 +120,8 @@ class Camera:
     """Index of a picture -> the picture, some 160 pixels wide."""
     size: tuple[int, int] = (0, 0)
     """Height and width of the pictures [pixels]."""
+    stills: dict[int, NDArray[np.uint8]] = attrs.field(factory=dict)
+    """Time of receipt [ns] -> the picture, some 320 pixels wide; a few, evenly over the window."""
 
     @property
     def name(self) -> str:
@@ -174,6 +179,8 @@ class Window:
     outcome: str = "unknown"
     sampled: bool = False
     """Whether states and commands are rows of a dataset, one at each tick."""
+    rig: Rig | None = None
+    """The rig at rest that it shows; None for a run or a demonstration."""
 
     @property
     def start_ns(self) -> int:
@@ -197,7 +204,8 @@ class Window:
             "answers": bool(self.asked), "chunks": any(each.used for each in self.asked),
             "pictures": any(each.pictures for each in self.cameras.values()),
             "guard": bool((self.document.get("control") or {}).get("guard")),
-            "outcome": self.outcome in ("success", "failure"), "demonstration": not self.asked,
+            "outcome": self.outcome in ("success", "failure"), "demonstration": not self.asked and self.rig is None,
+            "motion": self.rig is None, "rig": self.rig is not None,
         }  # fmt: skip
         return frozenset(name for name, there in has.items() if there)
 
@@ -304,12 +312,13 @@ class _Reading:
         self._asked: list[Asked] = []
         self._commanders: list[tuple[int, str]] = []
         self._guarded: list[tuple[int, str]] = []
-        self._keep_every_ns = 1
+        self._keep_every_ns = self._still_every_ns = 1
 
     def window(self, name: str) -> Window:
         """Read everything."""
         summary, contract = self._reader.summary(), self._contract
         self._keep_every_ns = max(1, (summary.end_ns - summary.start_ns) // KEPT)
+        self._still_every_ns = max(1, (summary.end_ns - summary.start_ns) // _STILLS)
         state_topics = {part.topic for part in contract.observation_parts if part.type == JointState.ros_type}
         wanted = {*state_topics, *self._pictures, *self._command_topics, MODEL_ANSWERS, COMMANDER, GUARD}
         there = {topic for topic, each in summary.topics.items() if each.count}
@@ -376,6 +385,8 @@ class _Reading:
         camera.size = shown.shape[:2]
         index = len(camera.pictures)
         camera.pictures.append(small_of(shown, digest))
+        if not camera.stills or t_ns - max(camera.stills) >= self._still_every_ns:
+            camera.stills[t_ns] = shrink(shown, STILL_WIDTH)
         if not camera.kept or t_ns - camera.times_ns[max(camera.kept)] >= self._keep_every_ns:
             camera.kept[index] = shrink(shown)
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 from ibrobot_terminal import GuideDescriptor, PanelDescriptor
 
-from ibrobot_core.api import Check, HardwareDescriptor, Late, SensorDescriptor, TeleopDescriptor, hookimpl
+from ibrobot_core.api import Check, Descriptor, HardwareDescriptor, Late, SensorDescriptor, TeleopDescriptor, hookimpl
 from ibrobot_core.app import Command
 from ibrobot_feetech.options import (
     TOOL,
@@ -115,6 +116,13 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         label="follow the leader arm",
         needs_terminal=lambda options: options.deadman != "none",
     )
+
+
+@hookimpl(optionalhook=True)
+def ibrobot_device_poses() -> Iterable[Descriptor[Any]]:
+    """Where a leader stands, without a run."""
+    read = Late("ibrobot_feetech.leader:read_pose")
+    yield Descriptor("so101_leader", read, "where an SO-101 leader stands", options=LeaderOptions)
 
 
 @hookimpl

@@ -6,6 +6,7 @@ import queue
 from collections.abc import Sequence
 from typing import override
 
+import attrs
 import numpy as np
 from ibrobot_terminal import HeldKeys
 from numpy.typing import NDArray
@@ -259,15 +260,23 @@ class LeaderTeleop(Teleop):
             f"{self._ctx.name}: {place}: {what}, {times} times in a row; check its power and the cable to it"
         )
 
+    def pose(self) -> dict[str, float]:
+        """Joint of the robot -> where the connected leader stands [rad]; limits of the robot do not apply."""
+        return dict(zip(self._joints, self._mapped().tolist(), strict=True))
+
     def _pose(self) -> Vector:
         """The leader's pose mapped to the robot's joints [rad], within their limits."""
+        return np.clip(self._mapped(), self._lower, self._upper)
+
+    def _mapped(self) -> Vector:
+        """The leader's pose mapped to the robot's joints [rad]."""
         ticks = self._ticks.astype(np.float64)
         low, high = self._range
         angles = np.where(self._mirrored, -1.0, 1.0) * self._arm.radians(ticks)
         opened = np.clip((ticks - low) / (high - low), 0.0, 1.0)
         opened = np.where(self._turned != self._mirrored, 1.0 - opened, opened)
-        positions = np.where(self._scaled, self._lower + opened * (self._upper - self._lower), angles)
-        return np.clip(positions, self._lower, self._upper)
+        positions: Vector = np.where(self._scaled, self._lower + opened * (self._upper - self._lower), angles)
+        return positions
 
     def _leader_pose(self, positions: Vector) -> Vector:
         """Positions of the robot's joints [rad] mapped to the leader's [ticks], within their calibrated ranges."""
@@ -311,3 +320,17 @@ class LeaderTeleop(Teleop):
         elif not self._taken_up:
             self._taken_up = bool(np.abs(self._ticks - self._resting).max() > _TAKEN_UP)
         return self._taken_up
+
+
+def read_pose(options: LeaderOptions, ctx: Context) -> dict[str, float]:
+    """Where a leader stands: joint of the robot -> position [rad]. Its torque is off afterwards.
+
+    Raises:
+        TeleopError: if it cannot be read.
+    """
+    leader = LeaderTeleop(attrs.evolve(options, deadman="none"), ctx)
+    leader.connect()
+    try:
+        return leader.pose()
+    finally:
+        leader.disconnect()

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 from ibrobot_core.api import (
     DecoderDescriptor,
+    Descriptor,
     HardwareDescriptor,
     Late,
     PolicyDescriptor,
@@ -67,6 +69,12 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
         picture=picture_size,
         summary="a camera in the simulated scene",
     )
+
+
+@hookimpl(optionalhook=True)
+def ibrobot_arm_views() -> Iterable[Descriptor[Any]]:
+    """What draws the arm in a camera."""
+    yield Descriptor("mujoco", from_module("arm_view", "ArmView"), "the arm's MJCF, drawn in a camera by MuJoCo")
 
 
 @hookimpl

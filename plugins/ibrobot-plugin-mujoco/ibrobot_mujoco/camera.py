@@ -61,7 +61,7 @@ class MujocoCamera(Sensor):
             raise SensorError(f"camera {self._ctx.name!r}: type mujoco needs a running simulation: {{type: mujoco}}")
         self._drawn = DrawnWorld.of(simulation, self._ctx.robot)
         self._model = self._drawn.model
-        self._camera = self._find_camera()
+        self._camera = find_camera(self._model, self._options, self._ctx.name)
         self._fovy = math.radians(self._model.cam_fovy[self._camera])
         self._last_slot = None
         self._states = bus.subscribe(PHYSICS_TOPIC, _QUEUE)
@@ -80,17 +80,6 @@ class MujocoCamera(Sensor):
             self._renderer = Renderer(self._model, self._camera, *size, shadows=self._options.shadows)
             self._ctx.log.info("camera %s renders with %s", self._ctx.name, self._renderer.backend)
         return self._renderer
-
-    def _find_camera(self) -> int:
-        """The camera's number in the model: by `camera`, or by the peripheral's name, with or without `_cam`."""
-        asked = self._options.camera
-        names = (asked,) if asked is not None else (self._ctx.name, f"{self._ctx.name}_cam")
-        for name in names:
-            number = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, name)
-            if number >= 0:
-                return int(number)
-        there = ", ".join(self._model.camera(i).name for i in range(self._model.ncam))
-        raise SensorError(f"camera {self._ctx.name!r}: no {' or '.join(names)} in the scene; its cameras are: {there}")
 
     @override
     def read(self, timeout_s: float) -> Image | CompressedImage | None:
@@ -153,3 +142,18 @@ class MujocoCamera(Sensor):
             p=np.hstack([k, np.zeros((3, 1))]).ravel(),
         )  # fmt: skip
         return ((f"/camera/{self._ctx.name}/camera_info", info),)
+
+
+def find_camera(model: mujoco.MjModel, options: CameraOptions, peripheral: str) -> int:
+    """The number in the model of a peripheral's camera: by `camera`, or by the name, with or without `_cam`.
+
+    Raises:
+        SensorError: if it has none.
+    """
+    names = (options.camera,) if options.camera is not None else (peripheral, f"{peripheral}_cam")
+    for name in names:
+        number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, name)
+        if number >= 0:
+            return int(number)
+    there = ", ".join(model.camera(i).name for i in range(model.ncam))
+    raise SensorError(f"camera {peripheral!r}: no {' or '.join(names)} in the scene; its cameras are: {there}")

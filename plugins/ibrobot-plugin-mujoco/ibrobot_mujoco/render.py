@@ -65,6 +65,22 @@ class Renderer:
         depth = far * near / (buffer.astype(float) * (far - near) + near)
         return np.ascontiguousarray(depth[::-1].astype(np.float32))
 
+    def render_geoms(self, drawn: mujoco.MjData) -> NDArray[np.int32]:
+        """The number of the geom in each of the camera's pixels, -1 for none, shape (height, width), top row first."""
+        flags = [int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]
+        self._scene.flags[flags] = True
+        try:
+            codes = self.render(drawn).astype(np.int32)
+        finally:
+            self._scene.flags[flags] = False
+        numbers = codes[..., 0] + (codes[..., 1] << 8) + (codes[..., 2] << 16)
+        geom_of = np.full(self._scene.ngeom + 1, -1, np.int32)
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and 0 <= geom.segid < self._scene.ngeom:
+                geom_of[geom.segid + 1] = geom.objid
+        result: NDArray[np.int32] = geom_of[np.clip(numbers, 0, self._scene.ngeom)]
+        return result
+
     def _draw(self, drawn: mujoco.MjData) -> None:
         self._context.make_current()
         everything = mujoco.mjtCatBit.mjCAT_ALL

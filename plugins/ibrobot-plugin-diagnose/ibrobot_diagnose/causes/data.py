@@ -44,7 +44,7 @@ class UnseenStart(CardCause):
 
     name = "unseen_start"
     title = "the run begins where demonstrations begin"
-    needs = frozenset({"state", "card"})
+    needs = frozenset({"motion", "state", "card"})
     explains = frozenset({"unseen_states", "stands_still"})
     remedy = "Bring the arm to the start of the demonstrations before each run, or record episodes that begin here."
 
@@ -73,7 +73,7 @@ class UnseenStates(CardCause):
     name = "unseen_states"
     title = "the arm stays where the data was"
     weak = True
-    needs = frozenset({"state", "card"})
+    needs = frozenset({"motion", "state", "card"})
     remedy = (
         "See what led the arm there, at the time that is given. If nothing else is wrong, record episodes that begin "
         "there and end well: `ibrobot record` with corrections."
@@ -105,7 +105,7 @@ class OtherSpeed(CardCause):
 
     name = "other_speed"
     title = "the arm moves as fast as in the data"
-    needs = frozenset({"commands", "card"})
+    needs = frozenset({"motion", "commands", "card"})
     explains = frozenset({"limits_low", "smoothing_averages"})
     remedy = (
         "Execute chunks at the rate of the data: `contract: {rate_hz: …}` of the robot and of the recordings must "

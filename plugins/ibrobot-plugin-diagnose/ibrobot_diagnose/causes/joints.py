@@ -65,7 +65,7 @@ class OtherUnits(CardCause):
 
     name = "other_units"
     title = "joint positions are in the unit of the data"
-    needs = frozenset({"state", "card"})
+    needs = frozenset({"motion", "state", "card"})
     explains = _CONSEQUENCES | {"joint_order", "joint_zero", "gripper_scaled", "gripper_reversed"}
     remedy = (
         "Deliver the joints in radians, as every driver here does (LeRobot's deliver degrees or -100 to 100), and give "
@@ -117,7 +117,7 @@ class JointOrder(CardCause):
 
     name = "joint_order"
     title = "the joints are in the order of the data"
-    needs = frozenset({"state", "card"})
+    needs = frozenset({"motion", "state", "card"})
     explains = _CONSEQUENCES | {"joint_zero", "gripper_scaled", "gripper_reversed", "arm_not_following"}
     remedy = (
         "Compare the order of `joints` in the robot YAML with that of the data (`ibrobot datasets info`), and the "
@@ -181,7 +181,7 @@ class JointZero(CardCause):
 
     name = "joint_zero"
     title = "the zeros of the joints are those of the data"
-    needs = frozenset({"state", "card pictures", "pictures"})
+    needs = frozenset({"motion", "state", "card pictures", "pictures"})
     explains = frozenset({"unseen_start", "unseen_states"})
     remedy = (
         "Calibrate the arm again, or choose its own calibration (`hardware: {calibration: …}`): put it into the pose "
@@ -229,7 +229,7 @@ class GripperScaled(CardCause):
 
     name = "gripper_scaled"
     title = "the gripper has the range of the data"
-    needs = frozenset({"state", "card"})
+    needs = frozenset({"motion", "state", "card"})
     explains = frozenset({"unseen_states", "unseen_start", "arm_not_following"})
     remedy = "Calibrate the gripper from shut to open; a percentage is no angle, and another jaw has another range."
 
@@ -256,7 +256,7 @@ class GripperReversed(CardCause):
 
     name = "gripper_reversed"
     title = "open is open, and shut is shut"
-    needs = frozenset({"state", "card"})
+    needs = frozenset({"motion", "state", "card"})
     explains = _CONSEQUENCES | {"joint_zero", "joint_order"}
     remedy = "Reverse the gripper: its sign in the calibration, or its two ends, are exchanged."
 

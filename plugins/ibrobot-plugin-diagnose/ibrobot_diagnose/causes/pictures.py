@@ -9,6 +9,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from ibrobot_diagnose.alignment import Shift, shift_of
 from ibrobot_diagnose.card import (
     CameraCard,
     Card,
@@ -19,7 +20,10 @@ from ibrobot_diagnose.card import (
     still,
 )
 from ibrobot_diagnose.cause import CardCause, Cause, Evidence, Reference, Shown, likelihood
-from ibrobot_diagnose.pictures import Shift, descriptors, nearest, resized, shift_of
+from ibrobot_diagnose.causes.moved import FAILS, WARNS, Sight, sights
+from ibrobot_diagnose.looks import Looks
+from ibrobot_diagnose.pictures import descriptors, nearest, resized
+from ibrobot_diagnose.rig import Rig
 from ibrobot_diagnose.window import Camera, Window
 
 UNSEEN = frozenset({"unseen_pictures", "camera_ignored"})
@@ -70,14 +74,38 @@ class PictureCause(CardCause):
         """How strong it is, by `threshold` and `certain`, and a sentence; None if it is uncertain."""
         raise NotImplementedError
 
+    def see(self, name: str, looks: Looks) -> tuple[float, str] | None:
+        """The same from the stills of a rig, of a camera with a name; None if they say nothing of it."""
+        return None
+
     @override
     def compare(self, window: Window, card: Card) -> Evidence | None:
+        if window.rig is not None and card.rig is not None:
+            return self._of_rigs(window.rig, card.rig)
         measured = [(result, pair) for pair in pairs(window, card) if (result := self.measure(pair)) is not None]
         if not measured:
             return None
         (number, text), pair = max(measured, key=lambda each: each[0][0])
         likely = likelihood(number, self.threshold, self.certain)
         return Evidence(text, number, self.unit, self.threshold, likely, pictures=pair.beside() if likely > 0.4 else ())
+
+    def _of_rigs(self, now: Rig, then: Rig) -> Evidence | None:
+        seen = sights(now, then)
+        measured = [
+            (*result, each) for each in seen
+            if each.looks is not None and (result := self.see(each.name, each.looks)) is not None
+        ]  # fmt: skip
+        if not measured:
+            return None
+        number, text, sight = max(measured, key=lambda each: each[0])
+        likely = likelihood(number, self.threshold, self.certain)
+        shown = now_and_then(sight) if likely > 0.4 else ()
+        return Evidence(text, number, self.unit, self.threshold, likely, pictures=shown, fails=self.certain)
+
+
+def now_and_then(sight: Sight) -> tuple[Shown, ...]:
+    """The pictures of a camera, now and in the reference."""
+    return Shown(f"{sight.name} now", sight.now), Shown(f"{sight.name} in the reference", sight.then)
 
 
 class CamerasExchanged(CardCause):
@@ -128,6 +156,25 @@ class CameraMoved(PictureCause):
         "Put the camera back: the two pictures of the report show where it was. `ibrobot preflight` shows it live. If "
         "it must stay there, record some episodes from its new place and train again."
     )
+
+    @override
+    def compare(self, window: Window, card: Card) -> Evidence | None:
+        if window.rig is None or card.rig is None:
+            return super().compare(window, card)
+        seen = sights(window.rig, card.rig)
+        clear = [each for each in seen if not each.unclear]
+        if not seen:
+            return None
+        worst = max(clear, key=lambda each: each.pixels) if clear else seen[0]
+        moved = bool(clear) and worst.pixels >= WARNS
+        if not moved and len(clear) < len(seen):
+            worst = next(each for each in seen if each.unclear)
+        number = 0.0 if worst.unclear else worst.pixels
+        return Evidence(
+            worst.text, number, "pixels", WARNS, likelihood(number, WARNS, 3 * WARNS), fails=FAILS,
+            details=tuple(each.text for each in seen if each is not worst), unclear=worst.unclear,
+            pictures=now_and_then(worst) if moved else (),
+        )  # fmt: skip
 
     @override
     def measure(self, pair: Pair) -> tuple[float, str] | None:
@@ -196,6 +243,12 @@ class PictureDark(_Level):
     name, title, number, words = "picture_dark", "pictures are as bright as in the data", "brightness", "dark"
     threshold, certain = 1.3, 1.9
     explains = UNSEEN | {"white_balance", "picture_blurred"}
+
+    @override
+    def see(self, name: str, looks: Looks) -> tuple[float, str] | None:
+        text = f"The pictures of {name} are {100 * looks.light:.0f} % as bright as in the reference."
+        return 1 / max(looks.light, 0.01), text
+
     remedy = (
         "Light the scene as in the recordings, and fix the exposure and gain of the camera in place of automatic ones."
     )
@@ -206,6 +259,11 @@ class PictureBright(_Level):
 
     name, title, number, words = "picture_bright", "pictures are not brighter than in the data", "brightness", "bright"
     above, threshold, certain = True, 1.25, 1.7
+
+    @override
+    def see(self, name: str, looks: Looks) -> tuple[float, str] | None:
+        return looks.light, f"The pictures of {name} are {100 * looks.light:.0f} % as bright as in the reference."
+
     explains = UNSEEN | {"white_balance", "picture_blurred", "picture_covered"}
     remedy = PictureDark.remedy
 
@@ -215,6 +273,12 @@ class PictureBlurred(_Level):
 
     name, title, number, words = "picture_blurred", "pictures are as sharp as in the data", "sharpness", "blurred"
     threshold, certain = 1.35, 2.2
+
+    @override
+    def see(self, name: str, looks: Looks) -> tuple[float, str] | None:
+        text = f"The details in pictures of {name} have {100 * looks.sharp:.0f} % of the contrast in the reference."
+        return 1 / max(looks.sharp, 0.01), text
+
     remedy = "Clean the lens and focus it (switch the automatic focus off); a long exposure in dim light blurs, too."
 
 
@@ -227,6 +291,11 @@ class PictureCovered(PictureCause):
     }  # fmt: skip
     unit, threshold, certain = "%", 15.0, 35.0
     remedy = "Take away what hangs before the lens: a cable, tape, a hand; or move what stands in the camera's view."
+
+    @override
+    def see(self, name: str, looks: Looks) -> tuple[float, str] | None:
+        share = 100 * looks.covered
+        return share, f"In {share:.0f} % of the areas of {name} in which there was something, there is nothing now."
 
     @override
     def measure(self, pair: Pair) -> tuple[float, str] | None:
@@ -297,6 +366,14 @@ class WhiteBalance(PictureCause):
     remedy = "Fix the white balance of the camera in place of the automatic one, and use the lamps of the recordings."
 
     @override
+    def see(self, name: str, looks: Looks) -> tuple[float, str] | None:
+        off, colour = max(
+            (max(value, 1 / value), colour) for value, colour in ((looks.red, "red"), (looks.blue, "blue"))
+        )
+        percent = 100 * (off - 1)
+        return percent, f"The colours of {name} are off: {colour} differs by {percent:.0f} % from the reference."
+
+    @override
     def measure(self, pair: Pair) -> tuple[float, str] | None:
         numbers, worst = numbers_of(pair.camera), (0.0, "red")
         for colour in ("red", "blue"):
@@ -322,6 +399,11 @@ class Bgr(PictureCause):
     )
 
     @override
+    def see(self, name: str, looks: Looks) -> tuple[float, str] | None:
+        text = f"Red and blue of {name} are exchanged: with them back, colours fit {looks.swapped:.1f} times as well."
+        return looks.swapped, text
+
+    @override
     def measure(self, pair: Pair) -> tuple[float, str] | None:
         ratio = pair.distance() / max(pair.distance(lambda small: small[..., ::-1]), 1e-3)
         text = (
@@ -345,6 +427,11 @@ class PictureFlipped(PictureCause):
     explains = UNSEEN | {"camera_moved", "joint_zero", "gripper_reversed", "picture_covered"}
     threshold, certain = 1.3, 2.0
     remedy = "Turn the camera, or its picture in the camera's options, as it was in the recordings."
+
+    @override
+    def see(self, name: str, looks: Looks) -> tuple[float, str] | None:
+        text = f"The picture of {name} is {looks.flip}: turned back, it fits {looks.flipped:.1f} times as well."
+        return looks.flipped, text
 
     @override
     def measure(self, pair: Pair) -> tuple[float, str] | None:

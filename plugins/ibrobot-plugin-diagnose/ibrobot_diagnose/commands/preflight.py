@@ -1,0 +1,82 @@
+"""`ibrobot preflight`: whether a rig is what it was."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import attrs
+
+from ibrobot_core.app import (
+    Emit,
+    RequestError,
+    RobotConfig,
+    Unsuccessful,
+    echo,
+    find_config,
+    installed_plugins,
+    load_config,
+    wrong_input,
+)
+from ibrobot_diagnose.options import Looking, PreflightOptions, PreflightReport
+from ibrobot_diagnose.references import card_of
+
+if TYPE_CHECKING:
+    from ibrobot_diagnose.card import Card
+
+
+@attrs.frozen(kw_only=True)
+class Preflight(PreflightOptions):
+    """Look at a ROBOT at rest, and say what differs from a reference; nothing moves.
+
+    Each line has a number, the numbers from which it warns and fails, and what to do. --take writes the reference: a
+    still of each camera with the pose of the arm, rates, calibration and versions. Datasets and checkpoints have one,
+    too. Exits with 1 if a line fails.
+    """
+
+    @wrong_input()
+    def __call__(self, emit: Emit) -> dict[str, Any] | None:
+        if self.against is not None and self.take is not None:
+            raise RequestError("--against and --take exclude each other: a reference is compared with, or taken")
+        if self.lockstep and not self.sim:
+            raise RequestError("--lockstep is for simulation: add --sim")
+        config = load_config(
+            find_config(self.robot, installed_plugins()), overrides=self.overrides, mode=self.mode, sim=self.sim
+        )
+        card = card_of(self.against) if self.against is not None else None
+        if card is not None and card.rig is None:
+            raise RequestError(
+                f"--against {self.against}: its card is from before preflight, and says nothing of the rig; make it "
+                "again (`ibrobot datasets card`), or take a reference (`--take FILE`)"
+            )
+        facts = _looked(self, config, card, emit)
+        if emit is not None:
+            emit(
+                PreflightReport(verdict=facts["verdict"], lines=tuple(facts["lines_of_text"]), out=str(self.out or ""))
+            )
+        if facts["verdict"] == "fail":
+            raise Unsuccessful(None if emit is not None else facts)
+        return None if emit is not None else facts
+
+    def show(self, facts: dict[str, Any]) -> None:
+        """Print the lines."""
+        for line in facts["lines_of_text"]:
+            echo(line)
+
+
+def _looked(options: PreflightOptions, config: RobotConfig, card: Card | None, emit: Emit) -> dict[str, Any]:
+    from ibrobot_diagnose.card import make_card
+    from ibrobot_diagnose.live import look
+    from ibrobot_diagnose.preflight import compared
+
+    def tell(what: str) -> None:
+        if emit is not None:
+            emit(Looking(what=what))
+
+    seen = look(config, options.seconds, lockstep=options.lockstep, tell=tell)
+    result = compared(seen, config, card)
+    if options.take is not None:
+        make_card([seen.window]).write(options.take)
+        result = result.taken(options.take)
+    if options.out is not None:
+        result.write(options.out)
+    return result.facts()

@@ -1,0 +1,105 @@
+"""How two pictures of a scene differ in light, colours and sharpness, area by area, whatever moves in them."""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_diagnose.alignment import AREAS, areas_of, rich_areas
+from ibrobot_diagnose.pictures import Grey, grey
+
+_LEAST = 0.5
+"""Share of an area that must count."""
+_DARK, _WHITE = 12.0, 245.0
+"""Grey values between which colours are to be seen."""
+_FLIPS = {
+    "upside down": (slice(None, None, -1), slice(None, None, -1)),
+    "mirrored": (slice(None), slice(None, None, -1)),
+}
+
+
+@attrs.frozen(eq=False)
+class Looks:
+    """A picture in relation to one of before. Medians over the areas, so that what has moved in some does not count."""
+
+    light: float
+    """Brightness; 1 if it is the same."""
+    red: float
+    """Red in relation to green; 1 if it is the same."""
+    blue: float
+    sharp: float
+    """Contrast of the smallest details; falls if the picture is blurred. 1 if it is the same."""
+    covered: float
+    """Share of the areas with something to see in which there is nothing now."""
+    swapped: float
+    """How many times as well the colours fit with red and blue exchanged."""
+    flip: str
+    """How the picture may be turned over."""
+    flipped: float
+    """How many times as well it fits if it is turned back."""
+
+
+def looks_of(reference: NDArray[np.uint8], picture: NDArray[np.uint8], weight: Grey) -> Looks:
+    """Compare pictures of the same size.
+
+    Args:
+        reference: shape (H, W, 3).
+        picture: likewise.
+        weight: of each pixel, 0 where something moves; shape (H, W).
+    """
+    weights = areas_of(weight)
+    used = weights.mean(axis=2) > _LEAST
+    if not used.any():
+        used = np.ones(AREAS, np.bool_)
+    then, now = (_means(each, weights) for each in (reference, picture))
+    light_then, light_now = (each.mean(axis=2) for each in (then, now))
+    light = float(np.median(((light_now + 2.0) / (light_then + 2.0))[used]))
+    seen = used & (light_then > _DARK) & (light_now > _DARK) & (light_then < _WHITE) & (light_now < _WHITE)
+    ratios = [_colours(each)[seen] for each in (then, now)] if seen.any() else [np.ones((1, 2))] * 2
+    red, blue = np.median(ratios[1] / ratios[0], axis=0).tolist()
+    plain, other = (float(np.abs(np.log(each / ratios[0])).mean()) for each in (ratios[1], ratios[1][:, ::-1]))
+    one, two = grey(reference), grey(picture)
+    rich = rich_areas(one, weight) & used
+    sharp, covered = 1.0, 0.0
+    if rich.any():
+        details = [np.sqrt((areas_of(_details(each)) ** 2).mean(axis=2))[rich] for each in (one, two)]
+        sharp = float(np.median(details[1]) / max(float(np.median(details[0])), 1e-3) / max(light, 0.05))
+        contrasts = [areas_of(each).std(axis=2)[rich] for each in (one, two)]
+        gone = contrasts[1] < 0.3 * contrasts[0] * min(light, 1.0)
+        # Out of focus, what is large is still there.
+        kept = np.abs(light_now - light * light_then)[rich] < 0.1 * light * light_then[rich] + 3.0
+        covered = float((gone & ~kept).mean())
+    flip, flipped = _flip(light_then, light_now)
+    return Looks(light, red, blue, sharp, covered, (plain + 0.03) / (other + 0.03), flip, flipped)
+
+
+def _means(picture: NDArray[np.uint8], weights: NDArray[np.float32]) -> NDArray[np.float64]:
+    """The mean colour of each area, shape (rows, columns, 3)."""
+    total = weights.sum(axis=2) + 1e-6
+    channels = [(areas_of(picture[..., i].astype(np.float32)) * weights).sum(axis=2) / total for i in range(3)]
+    return np.stack(channels, axis=2).astype(np.float64)
+
+
+def _colours(means: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Red and blue in relation to green, shape (…, 2)."""
+    result: NDArray[np.float64] = (means[..., [0, 2]] + 1.0) / (means[..., [1]] + 1.0)
+    return result
+
+
+def _details(values: Grey) -> Grey:
+    result = np.zeros_like(values)
+    inner = values[:-2, 1:-1] + values[2:, 1:-1] + values[1:-1, :-2] + values[1:-1, 2:] - 4 * values[1:-1, 1:-1]
+    result[1:-1, 1:-1] = inner
+    return result
+
+
+def _flip(then: NDArray[np.float64], now: NDArray[np.float64]) -> tuple[str, float]:
+    def fits(each: NDArray[np.float64]) -> float:
+        deviation = then.std() * each.std()
+        product = ((then - then.mean()) * (each - each.mean())).mean()
+        return float(product / deviation) if deviation > 1e-6 else 1.0
+
+    own = 1.05 - fits(now)
+    how, other = min(((name, 1.05 - fits(now[at])) for name, at in _FLIPS.items()), key=lambda each: each[1])
+    return how, own / max(other, 1e-3)

@@ -1,0 +1,210 @@
+"""The rig at a time: a still of each camera with the pose of the arm, rates, calibration and versions."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ibrobot_diagnose.pictures import png, read_png
+
+if TYPE_CHECKING:
+    from ibrobot_diagnose.window import Window
+
+type Floats = NDArray[np.float64]
+
+STILL_WIDTH = 320
+"""Width of stills [pixels]; between this and twice as much."""
+
+
+@attrs.frozen(eq=False)
+class Still:
+    """A picture with the pose in which the arm was."""
+
+    picture: NDArray[np.uint8]
+    """Shape (H, W, 3)."""
+    pose: Floats
+    """Positions of the joints [rad], shape (J,); NaN where unknown."""
+    moving: NDArray[np.bool_] | None = None
+    """Where something may move against the camera: the arm, for a camera that stands; shape (H, W). None if unknown."""
+
+
+@attrs.frozen(eq=False)
+class RigCamera:
+    """A camera of a rig."""
+
+    size: tuple[int, int]
+    """Height and width of its pictures [pixels]."""
+    stills: tuple[Still, ...]
+    rate_hz: float | None = None
+    settings: Mapping[str, Any] = attrs.field(factory=dict)
+    """Its options in the robot YAML but for the device, e.g. exposure."""
+    focal: float | None = None
+    """Focal length in relation to the width of the pictures; None if unknown."""
+    stands: bool | None = None
+    """Whether it stands still beside the arm, and is not on it; None if unknown."""
+
+
+@attrs.frozen(eq=False)
+class Rig:
+    """What a rig was at a time."""
+
+    robot: str
+    taken: str
+    """Date, ISO 8601; empty if unknown."""
+    joints: tuple[str, ...]
+    cameras: Mapping[str, RigCamera]
+    """Key of an observation -> its camera."""
+    loop_hz: float | None = None
+    """Rate at which joint states come."""
+    asked_hz: float | None = None
+    """Rate that the robot YAML asks for."""
+    calibration: Mapping[str, Mapping[str, Mapping[str, Any]]] = attrs.field(factory=dict)
+    """Name of the hardware -> joint -> numbers of its calibration."""
+    versions: Mapping[str, str] = attrs.field(factory=dict)
+    """Package -> version."""
+    fingerprint: str = ""
+    """That of the contract."""
+    leaders: Mapping[str, Mapping[str, float]] = attrs.field(factory=dict)
+    """Teleoperation device -> joint -> its position less that of the robot, at rest [rad]."""
+    conditions: tuple[Mapping[str, Any], ...] = ()
+    """Abnormal conditions of joints, as fields of `Condition`."""
+    absent: Mapping[str, str] = attrs.field(factory=dict)
+    """Sensor that this machine cannot run -> why."""
+    notes: tuple[str, ...] = ()
+    """What could not be done, and why; not stored."""
+
+    def facts(self) -> dict[str, Any]:
+        """The rig as a JSON object."""
+        return {
+            "robot": self.robot, "taken": self.taken, "joints": list(self.joints), "loop_hz": self.loop_hz,
+            "asked_hz": self.asked_hz, "calibration": self.calibration, "versions": dict(self.versions),
+            "fingerprint": self.fingerprint, "leaders": {name: dict(each) for name, each in self.leaders.items()},
+            "cameras": {key: _camera_facts(each) for key, each in self.cameras.items()},
+        }  # fmt: skip
+
+    @classmethod
+    def of(cls, facts: Mapping[str, Any]) -> Rig:
+        """The rig in the facts of a card, which may come from anywhere.
+
+        Raises:
+            ValueError, KeyError, TypeError, AttributeError: if they are damaged.
+        """
+        joints = tuple(str(each) for each in facts["joints"])
+        calibration = {
+            str(name): {str(joint): dict(numbers) for joint, numbers in each.items()}
+            for name, each in facts["calibration"].items()
+        }
+        return cls(
+            str(facts["robot"]), str(facts["taken"]), joints,
+            {str(key): _camera_of(each, len(joints)) for key, each in facts["cameras"].items()},
+            _number(facts["loop_hz"], "loop_hz"), _number(facts["asked_hz"], "asked_hz"), calibration,
+            {str(name): str(each) for name, each in facts["versions"].items()}, str(facts["fingerprint"]),
+            {
+                str(name): {str(joint): _finite(value, str(joint)) for joint, value in each.items()}
+                for name, each in facts["leaders"].items()
+            },
+        )  # fmt: skip
+
+
+def _finite(value: Any, name: str) -> float:
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError(f"{name}: {value!r} is not a finite number")
+    return number
+
+
+def _number(value: Any, name: str) -> float | None:
+    return None if value is None else _finite(value, name)
+
+
+def _camera_facts(camera: RigCamera) -> dict[str, Any]:
+    return {
+        "size": list(camera.size), "rate_hz": camera.rate_hz, "settings": dict(camera.settings),
+        "focal": camera.focal, "stands": camera.stands,
+        "stills": [
+            {
+                "picture": base64.b64encode(png(each.picture)).decode(),
+                "pose": [None if math.isnan(value) else float(f"{value:.6g}") for value in each.pose.tolist()],
+            }
+            for each in camera.stills
+        ],
+    }  # fmt: skip
+
+
+def _camera_of(facts: Mapping[str, Any], joints: int) -> RigCamera:
+    stills = []
+    for each in facts["stills"]:
+        pose = np.array([math.nan if value is None else _finite(value, "pose") for value in each["pose"]])
+        if pose.shape != (joints,):
+            raise ValueError(f"the pose of a still has {pose.size} joints, must have {joints}")
+        stills.append(Still(read_png(base64.b64decode(each["picture"], validate=True)), pose))
+    height, width = (int(each) for each in facts["size"])
+    stands = facts["stands"]
+    if not isinstance(stands, bool | None):
+        raise ValueError(f"stands must be true, false or null, not {stands!r}")
+    focal = _number(facts["focal"], "focal")
+    return RigCamera(
+        (height, width), tuple(stills), _number(facts["rate_hz"], "rate_hz"), dict(facts["settings"]), focal, stands
+    )
+
+
+def rig_of(window: Window) -> Rig | None:
+    """The rig in a window; None if it says nothing of it."""
+    if not window.joints or not window.metadata:
+        return None
+    document, metadata = window.document, window.metadata
+    settings = {str(each.get("name")): _settings(each) for each in document.get("peripherals") or ()}
+    names = {
+        str(each.get("key")): str(each.get("peripheral"))
+        for each in (document.get("contract") or {}).get("observations") or ()
+    }
+    cameras = {}
+    for key, camera in window.cameras.items():
+        if camera.stills:
+            times = np.array(list(camera.stills), np.int64)
+            poses = window.state.at(times)
+            stills = tuple(Still(picture, pose) for picture, pose in zip(camera.stills.values(), poses, strict=True))
+            rate = None if window.sampled else rate_of(np.array(camera.times_ns, np.int64))
+            cameras[key] = RigCamera(camera.size, stills, rate, settings.get(names.get(key, ""), {}))
+    asked = (document.get("control") or {}).get("rate_hz")
+    return Rig(
+        metadata.get("robot", ""), "", window.joints, cameras,
+        None if window.sampled else rate_of(np.unique(window.state.stamps_ns)),
+        float(asked) if isinstance(asked, int | float) else None, _json(metadata, "calibration"),
+        _versions(metadata), metadata.get("fingerprint", ""),
+    )  # fmt: skip
+
+
+def rate_of(times_ns: NDArray[np.int64]) -> float | None:
+    """The rate of messages [Hz]; None for fewer than five."""
+    if len(times_ns) < 5 or times_ns[-1] <= times_ns[0]:
+        return None
+    return float((len(times_ns) - 1) / ((times_ns[-1] - times_ns[0]) / 1e9))
+
+
+def _settings(peripheral: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        str(name): value
+        for name, value in peripheral.items()
+        if name not in ("name", "kind", "device", "serial", "transform", "sim", "strict")
+    }
+
+
+def _json(metadata: Mapping[str, str], name: str) -> Any:
+    try:
+        value = json.loads(metadata.get(name, "{}"))
+    except ValueError:
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def _versions(metadata: Mapping[str, str]) -> dict[str, str]:
+    own = {"ibrobot-core": metadata["ibrobot_version"]} if "ibrobot_version" in metadata else {}
+    return {**own, **{str(name): str(each) for name, each in _json(metadata, "plugin_versions").items()}}
