@@ -56,7 +56,8 @@ SUBSCRIBERS = {
             "ibrobot_kinematics/description.py", "ibrobot_eval/cameras.py", "ibrobot_eval/film.py",
             "ibrobot_gym/environment.py", "ibrobot_mujoco/camera.py", "ibrobot_mujoco/viewer.py",
             "ibrobot_planning/tasks/performing.py", "ibrobot_ros/topics.py", "ibrobot_ros2/inference.py",
-            "ibrobot_kinematics/tool_pose.py", "ibrobot_web/objects.py", "ibrobot_web/viewer.py",
+            "ibrobot_diagnose/live.py", "ibrobot_kinematics/tool_pose.py", "ibrobot_web/objects.py",
+            "ibrobot_web/viewer.py",
             "ibrobot_webxr/images.py", "ibrobot_webxr/server.py", "ibrobot_zenoh/shared_topics.py",
             # The world.
             "ibrobot_planning/world/clouds.py", "ibrobot_planning/world/frames.py",
@@ -77,6 +78,7 @@ SENDERS = {
     "ibrobot_planning/execution/motions.py": "/planning/go_to",
     "ibrobot_planning/execution/source.py": "source planner",
     "ibrobot_ros2/goals.py": "FollowJointTrajectory",
+    "ibrobot_diagnose/live.py": "",  # it sends nothing
     # The session, the door of goals, and control, through which all others go.
     "ibrobot_planning/execution/door.py": "",
     "ibrobot_core/control/host.py": "",
@@ -115,7 +117,7 @@ COMMANDS = {
             "convert", "damiao", "datasets", "datasets check", "datasets info", "description", "doctor", "episodes",
             "episodes delete", "episodes list", "episodes mark", "episodes repair", "episodes trash", "episodes trim",
             "explain", "export", "feetech", "gamepad",
-            "lerobot", "plan", "plugins", "serve", "train",
+            "lerobot", "plan", "plugins", "preflight", "serve", "train",
         ),
         "",
     ),

@@ -12,6 +12,7 @@ from ibrobot_core.interfaces import run
 
 PLUGINS = Path(__file__).parents[2] / "plugins"
 PROGRAMS = {
+    "ibrobot_diagnose/live.py",
     "ibrobot_gym/environment.py",
     *(f"ibrobot_eval/{name}.py" for name in ("episodes", "film", "blinded")),
     "ibrobot_lerobot_program/run.py",

@@ -165,6 +165,8 @@ _TURNS = (0.0, 0.09, -0.09, 0.18, -0.18)
 """Turns in the picture's plane from which an alignment begins [rad]."""
 AREAS = (9, 12)
 """Areas of a picture, each of which is seen in its place or not."""
+_LEAST_SIDE = 48
+"""Pixels below which a picture is too small."""
 _RICH = 5.0
 """Deviation of the grey values from which an area shows something."""
 _ALIKE = 0.6
@@ -188,7 +190,7 @@ class Moved:
 
     @property
     def unclear(self) -> str:
-        """Why it cannot be told; empty if it can."""
+        """Why it is uncertain; empty if it is not."""
         if self.rich < 4:
             return f"only {self.rich} of {AREAS[0] * AREAS[1]} areas of the picture show something that stands still"
         if self.is_other_view or self.found >= max(3, 0.3 * self.rich):
@@ -197,8 +199,8 @@ class Moved:
 
     @property
     def is_other_view(self) -> bool:
-        """Whether nearly nothing of the reference can be found."""
-        return self.rich >= 8 and max(self.in_place, self.found) < 0.12 * self.rich
+        """Whether nearly nothing of the reference can be found; on a table with few things, they may have moved."""
+        return self.rich >= 25 and max(self.in_place, self.found) < 0.2 * self.rich
 
 
 def moved_of(reference: Grey, picture: Grey, weight: Grey, shown: Grey) -> Moved:
@@ -210,6 +212,8 @@ def moved_of(reference: Grey, picture: Grey, weight: Grey, shown: Grey) -> Moved
         weight: of each pixel of the reference: 0 where something moves, e.g. the arm.
         shown: of each pixel of the picture, likewise.
     """
+    if reference.shape != picture.shape or min(reference.shape) < _LEAST_SIDE:
+        return Moved(0.0, 0.0, 0, 0, 0)
     levels = {level: (_textures(reference, level), _textures(picture, level)) for level in _LEVELS}
     rich = rich_areas(reference, weight)
     still, at = np.zeros(4), _alike(*levels[1], weight, shown, np.zeros(4), rich)
@@ -231,13 +235,13 @@ def moved_of(reference: Grey, picture: Grey, weight: Grey, shown: Grey) -> Moved
             best, (int(alike.sum()), _quality(*levels[1], weight, shown, p), p, alike),
             key=lambda each: each[:2],
         )  # fmt: skip
-    found, _, p, alike = best
+    matches, _, p, alike = best
     # What is found all over the picture tells of all of it, also of a turn about its middle.
-    spread = found >= 8 and alike.any(axis=1).sum() >= 3 and alike.any(axis=0).sum() >= 4
-    x, y = _centres(reference.shape, np.ones_like(rich) if spread else alike if found else rich)
+    spread = matches >= 8 and alike.any(axis=1).sum() >= 3 and alike.any(axis=0).sum() >= 4
+    x, y = _centres(reference.shape, np.ones_like(rich) if spread else alike if matches else rich)
     moved_x, moved_y = p[0] + p[2] * x - p[3] * y, p[1] + p[3] * x + p[2] * y
     pixels = float(np.median(np.hypot(moved_x, moved_y))) * 640 / reference.shape[1] if len(x) else 0.0
-    return Moved(pixels, float(np.arctan2(p[3], 1 + p[2])), int(rich.sum()), in_place, found)
+    return Moved(pixels, float(np.arctan2(p[3], 1 + p[2])), int(rich.sum()), in_place, matches)
 
 
 def _quality(

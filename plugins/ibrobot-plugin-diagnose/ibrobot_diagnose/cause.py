@@ -74,7 +74,7 @@ class Evidence:
     fails: float | None = None
     """The number from which a rig is not fit to be used; None if the likelihood says it."""
     unclear: str = ""
-    """Why it cannot be told; empty if it can."""
+    """Why it is uncertain; empty if it is not."""
 
     @property
     def verdict(self) -> Verdict:

@@ -215,6 +215,7 @@ def write_preflight(out: Path, facts: Mapping[str, Any], findings: Sequence[Find
         sections.append(ReportSection(f"Not tested ({len(untested)})", (Table(("cause", "why"), untested),)))
     if facts["notes"]:
         sections.append(ReportSection("Notes", tuple(Text(note) for note in facts["notes"])))
-    shown = [each for finding in findings for each in finding.evidence.pictures]
+    bad = (each.evidence for each in findings if each.evidence.verdict in ("fail", "warn"))
+    shown = [each for evidence in bad for each in evidence.pictures]
     replace_file(out / "report.html", as_page(out, facts["first"], sections, more=_figures(shown)))
     replace_file(out / "preflight.json", json.dumps(facts) + "\n")

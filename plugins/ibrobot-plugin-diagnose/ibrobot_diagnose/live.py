@@ -31,9 +31,9 @@ from ibrobot_core.app import (
     Received,
     RobotConfig,
     Runtime,
+    RunView,
     Session,
     SourceWorker,
-    StreamingRun,
     calibrations,
     installed_plugins,
 )
@@ -120,7 +120,7 @@ def look(
 class _Still(SourceWorker):
     """Commands nothing."""
 
-    def __init__(self, session: StreamingRun, mode: ControlMode) -> None:
+    def __init__(self, session: RunView, mode: ControlMode) -> None:
         super().__init__(session, mode, "nothing moves")
 
     @override
@@ -182,7 +182,7 @@ def _with_leaders(rig: Rig, session: Session) -> Rig:
     """The rig with how far its leaders stand from it."""
     config, measured = session.config, session.measured()
     at = dict(zip(config.robot.joint_names, measured.position.tolist(), strict=True))
-    known = set(session.registry.types(DEVICE_POSE))
+    known = {each.type for each in session.registry.of_kind(DEVICE_POSE)}
     groups = {name: group for mode in config.control_modes.values() for group, name in mode.devices.items()}
     leaders: dict[str, dict[str, float]] = {}
     notes: list[str] = []

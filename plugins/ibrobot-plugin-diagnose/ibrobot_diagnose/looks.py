@@ -70,7 +70,8 @@ def looks_of(reference: NDArray[np.uint8], picture: NDArray[np.uint8], weight: G
         # Out of focus, what is large is still there.
         kept = np.abs(light_now - light * light_then)[rich] < 0.1 * light * light_then[rich] + 3.0
         covered = float((gone & ~kept).mean())
-    flip, flipped = _flip(light_then, light_now)
+    every = np.ones_like(weights)
+    flip, flipped = _flip(*(_means(each, every).mean(axis=2) for each in (reference, picture)))
     return Looks(light, red, blue, sharp, covered, (plain + 0.03) / (other + 0.03), flip, flipped)
 
 

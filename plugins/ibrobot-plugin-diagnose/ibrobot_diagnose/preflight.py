@@ -18,7 +18,7 @@ from ibrobot_diagnose.report import finding_facts
 from ibrobot_diagnose.window import Window
 
 _WORDS: Mapping[Verdict, str] = {"ok": "ok  ", "warn": "warn", "fail": "FAIL", "cannot tell": "?   "}
-_COUNTED: Mapping[Verdict, str] = {"ok": "ok", "warn": "warn", "fail": "fail", "cannot tell": "cannot be told"}
+_COUNTED: Mapping[Verdict, str] = {"ok": "ok", "warn": "warn", "fail": "fail", "cannot tell": "uncertain"}
 _ORDER: Sequence[Verdict] = ("fail", "warn", "cannot tell", "ok")
 
 
@@ -45,7 +45,7 @@ class Preflight:
 
     @property
     def verdict(self) -> Verdict:
-        """The worst one; what cannot be told is no fault."""
+        """The worst one; what is uncertain is no fault."""
         worst = self.findings[0].evidence.verdict if self.findings else "ok"
         return worst if worst in ("fail", "warn") else "ok"
 

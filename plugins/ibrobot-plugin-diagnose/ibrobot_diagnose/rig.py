@@ -44,7 +44,7 @@ class RigCamera:
     stills: tuple[Still, ...]
     rate_hz: float | None = None
     settings: Mapping[str, Any] = attrs.field(factory=dict)
-    """Its options in the robot YAML but for the device, e.g. exposure."""
+    """Its options in the robot YAML without the device, e.g. exposure."""
     focal: float | None = None
     """Focal length in relation to the width of the pictures; None if unknown."""
     stands: bool | None = None

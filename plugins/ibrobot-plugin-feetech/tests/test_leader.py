@@ -12,7 +12,7 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_feetech.emulator import Emulator
-from ibrobot_feetech.leader import LeaderTeleop
+from ibrobot_feetech.leader import LeaderTeleop, read_pose
 from ibrobot_feetech.options import LeaderOptions, check_leader
 from ibrobot_testing import TeleopSuite
 from ibrobot_testing.contexts import START_NS, host_context, make_robot
@@ -571,3 +571,15 @@ class TestOneOfTwo:
     def test_options_that_exclude_each_other(self, given: dict[str, Any], message: str):
         with pytest.raises(ValueError, match=message):
             LeaderOptions("/dev/null", "leader", **given)
+
+
+def test_pose_is_read_without_a_terminal(emulator, calibration_file):
+    """Also where the robot's limits end, and the torque is off then."""
+    options = LeaderOptions(port=emulator.port, calibration=str(calibration_file), scaled=())
+    emulator.servos[1].turn(3500 + OFFSETS[0])
+    pose = read_pose(options, host_context())
+    assert set(pose) == set(JOINTS)
+    assert pose["shoulder_pan"] > 1.8
+    assert not any(servo.get("torque_enable") for servo in emulator.servos.values())
+    with pytest.raises(TeleopError, match="nowhere"):
+        read_pose(attrs.evolve(options, port="nowhere"), host_context())

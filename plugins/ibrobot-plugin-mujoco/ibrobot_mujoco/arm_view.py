@@ -58,7 +58,7 @@ class ArmView:
     def moving(self, positions: Vector, room: float = 0.011) -> NDArray[np.bool_]:
         """Where something may move against the camera, shape (H, W).
 
-        That is the arm but for its base and, for a camera on the arm, all but the link that carries it.
+        That is the arm without its base; for a camera on the arm, all except the link that carries it.
 
         Args:
             positions: of the joints [rad], shape (J,).
@@ -93,7 +93,7 @@ def _mounted(config: RobotConfig, camera: str, info: CameraInfo | None) -> tuple
     if mount is None:
         raise NotSupported(f"it is unknown where camera {camera} is: set its `transform`")
     if info is None or not info.k[4] > 0:
-        raise NotSupported(f"camera {camera} is not calibrated: `ibrobot camera calibrate` makes the file for `info`")
+        raise NotSupported(f"camera {camera} is not calibrated: set its `info`, the file of a calibration")
     try:
         spec = several_arms(path, arms) if (arms := config.robot.description.arms) else read_mjcf(path).spec.copy()
     except KinematicsError as error:

@@ -32,7 +32,7 @@ class Sight:
     moved: Moved | None
     """None if it cannot be compared."""
     unclear: str
-    """Why it cannot be told whether it has moved; empty if it can."""
+    """Why it is uncertain whether it has moved; empty if it is not."""
     masked: bool
     """Whether the arm was drawn, so that it counts for nothing."""
     focal: float | None
@@ -63,7 +63,7 @@ class Sight:
         """A sentence on it."""
         how = "" if self.masked else ", without a mask of the arm"
         if self.moved is None or self.unclear:
-            return f"It cannot be told whether the camera {self.name} has moved: {self.unclear}."
+            return f"Whether the camera {self.name} has moved is uncertain: {self.unclear}."
         moved = self.moved
         if moved.is_other_view:
             return (
@@ -107,8 +107,8 @@ def _sight(name: str, now: RigCamera, then: RigCamera, *, same_joints: bool) -> 
     same = apart < (_SAME_ON_ARM if stands is False else _SAME)
     # What stands still shows it: all of the picture if the arm stands as before, otherwise what is not the arm.
     mask = masked and not (same and stands is not False)
-    found = [_moved(reference, each, mask=mask) for each in now.stills[-_AGREE:]]
-    moved = sorted(found, key=lambda each: each.pixels)[len(found) // 2]
+    each_moved = [_moved(reference, each, mask=mask) for each in now.stills[-_AGREE:]]
+    moved = sorted(each_moved, key=lambda each: each.pixels)[len(each_moved) // 2]
     unclear = moved.unclear
     in_place = moved.pixels < WARNS and moved.in_place >= max(4, 0.5 * moved.rich)
     if not mask and not same and stands is not True and not in_place:

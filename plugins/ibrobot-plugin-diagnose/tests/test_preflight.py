@@ -1,0 +1,101 @@
+"""`ibrobot preflight` on a simulated robot, in simulated time."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+from command_line import run_here
+
+from ibrobot_core.app import installed_plugins
+
+_REGISTRY = installed_plugins()
+_RENDERS = ("sensor", "mujoco") in _REGISTRY.entries and _REGISTRY.missing("sensor", "mujoco") is None
+pytestmark = [
+    pytest.mark.integration,  # another package simulates the robot
+    pytest.mark.skipif(not _RENDERS, reason="needs ibrobot-plugin-mujoco, and OpenGL"),
+]
+
+SIM = ("so101", "--sim", "--lockstep", "--seconds", "0.5")
+
+
+def preflight(*arguments):
+    """Its exit code and facts."""
+    done = run_here("preflight", *SIM, "--json", *arguments)
+    assert done.stdout, done.stderr
+    return done.returncode, json.loads(done.stdout)
+
+
+def unwell(facts):
+    return {each["name"]: each["verdict"] for each in facts["lines"] if each["verdict"] != "ok"}
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    """A reference of the robot at rest."""
+    file = tmp_path_factory.mktemp("rig") / "rig.json"
+    code, facts = preflight("--take", file)
+    assert (code, facts["verdict"], facts["taken"]) == (0, "ok", str(file))
+    return file
+
+
+def test_rig_is_as_it_was(reference):
+    code, facts = preflight("--against", reference)
+    assert (code, facts["verdict"], unwell(facts), facts["notes"]) == (0, "ok", {}, [])
+    assert {"camera_moved", "zero_shifted", "picture_dark", "camera_slow"} <= {each["name"] for each in facts["lines"]}
+
+
+def test_arm_that_stands_elsewhere_is_no_fault(reference):
+    code, facts = preflight("--against", reference, "--set", "simulation.start_pose=home")
+    assert (code, unwell(facts)) == (0, {"zero_shifted": "cannot tell"})
+
+
+def test_camera_that_moved_fails_with_a_report(reference, tmp_path):
+    done = run_here(
+        "preflight", *SIM, "--against", reference, "--out", tmp_path,
+        "--set", "simulation.scene={type: pick_cube, camera_turn: [0.012, 0.012]}",
+    )  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    first, *_, last = done.stdout.splitlines()
+    assert re.match(r"FAIL  camera_moved: The camera top has moved: its picture is shifted by 1\d\.\d of 640", first)
+    assert "warns from 3, fails from 5" in first
+    assert "What to do: Put the camera back" in done.stdout
+    assert last.startswith("so101 is not fit to be used: 1 fail, 0 warn")
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("<img") == 2
+    assert "top in the reference" in page
+    assert not re.search(r"""(?:src|href)=["']?https?:""", page)
+    assert json.loads((tmp_path / "preflight.json").read_text())["verdict"] == "fail"
+
+
+def test_events_tell_what_is_done(reference):
+    done = run_here("preflight", *SIM, "--against", reference, "--events")
+    events = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [each["event"] for each in events][-1] == "preflightreport"
+    assert events[-1]["verdict"] == "ok"
+    assert {"control", "the window"} <= {each["what"] for each in events[:-1]}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("so101", "--lockstep"), "--lockstep is for simulation"),
+        (("so101", "--sim", "--take", "a", "--against", "b"), "--against and --take exclude each other"),
+        (("so101", "--sim", "--against", "nowhere"), "nowhere"),
+        (("no_robot",), "no_robot"),
+    ],
+)
+def test_wrong_options_are_named(arguments, says):
+    done = run_here("preflight", *arguments)
+    assert done.returncode == 2
+    assert says in done.stderr
+
+
+def test_card_from_before_has_no_rig(reference, tmp_path):
+    facts = json.loads(reference.read_text())
+    del facts["rig"]
+    (tmp_path / "old.json").write_text(json.dumps(facts))
+    done = run_here("preflight", *SIM, "--against", tmp_path / "old.json")
+    assert done.returncode == 2
+    assert "from before preflight" in done.stderr
