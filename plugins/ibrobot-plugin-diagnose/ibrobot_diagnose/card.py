@@ -120,8 +120,15 @@ class Card:
         return result
 
     def write(self, path: Path) -> None:
-        """Write the card to a file."""
-        replace_file(path, json.dumps(self.facts(), separators=(",", ":")) + "\n")
+        """Write the card to a file.
+
+        Raises:
+            DatasetError: if it cannot be written.
+        """
+        try:
+            replace_file(path, json.dumps(self.facts(), separators=(",", ":")) + "\n")
+        except OSError as error:
+            raise DatasetError(f"{path}: cannot be written: {error.strerror or error}") from error
 
     def facts(self) -> dict[str, Any]:
         """The card as a JSON object."""
@@ -145,6 +152,7 @@ class Card:
         Raises:
             DatasetError: if it cannot be read, or is no card of this version.
         """
+        problem: Exception
         try:
             if path.stat().st_size > _LARGEST:
                 raise ValueError(f"it is larger than {_LARGEST >> 20} MiB")
@@ -155,7 +163,8 @@ class Card:
                 raise ValueError(f"it has version {facts.get('version')!r}; this ibrobot reads version {VERSION}")
             return cls._of(facts)
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise DatasetError(f"{path}: cannot be read as a card of data: {error}") from None
+            problem = error
+        raise DatasetError(f"{path}: cannot be read as a card of data: {problem}")
 
     @classmethod
     def _of(cls, facts: Mapping[str, Any]) -> Card:

@@ -37,6 +37,10 @@ class Preflight(PreflightOptions):
     def __call__(self, emit: Emit) -> dict[str, Any] | None:
         if self.against is not None and self.take is not None:
             raise RequestError("--against and --take exclude each other: a reference is compared with, or taken")
+        if self.take is not None and self.take.is_dir():
+            raise RequestError(f"--take {self.take}: is a folder; name the file of the reference")
+        if self.out is not None and self.out.exists() and not self.out.is_dir():
+            raise RequestError(f"--out {self.out}: is a file; name a folder")
         if self.lockstep and not self.sim:
             raise RequestError("--lockstep is for simulation: add --sim")
         config = load_config(
