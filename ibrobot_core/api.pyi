@@ -5,6 +5,7 @@ from ibrobot_core.hookspecs import hookimpl as hookimpl
 from ibrobot_core.descriptors import (
     Descriptor as Descriptor,
     HardwareDescriptor as HardwareDescriptor,
+    MessageDescriptor as MessageDescriptor,
     SensorDescriptor as SensorDescriptor,
     TeleopDescriptor as TeleopDescriptor,
     PolicyDescriptor as PolicyDescriptor,

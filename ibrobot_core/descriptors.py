@@ -7,10 +7,11 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import attrs
 
+from ibrobot_core.errors import PluginError
 from ibrobot_core.options import NoOptions, OptionFault, OptionName, documented, mistakes, option
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from ibrobot_core.component_config import ComponentConfig
     from ibrobot_core.events import Event
     from ibrobot_core.interfaces.run import RunAccess, RunView
-    from ibrobot_core.messages import CompressedImage, Image
+    from ibrobot_core.messages import CompressedImage, Image, Message
     from ibrobot_core.robot import Robot
     from ibrobot_core.schema import RobotConfig
     from ibrobot_core.selection import JointFeature
@@ -149,9 +150,40 @@ class SensorDescriptor(Descriptor["interfaces.Sensor"]):
         MissingDependency: if it is not there. A run continues without a sensor that it does not need.
     """
 
+    topic: str = ""
+    """Topic of its messages, with `{name}` for the peripheral's; empty for a camera, and if only its options say it."""
+    message: str = ""
+    """ROS type of its messages, with `topic`."""
+
     def kept(self, options: Any) -> Mapping[str, Any]:
-        """The size of its images."""
-        return {"picture": self.picture(options)}
+        """The size of its images, and its topic."""
+        given = {"topic": self.topic, "message": self.message} if self.topic else {}
+        return {"picture": self.picture(options), **given}
+
+
+@attrs.frozen
+class MessageDescriptor:
+    """A message type that a plugin defines, so that contracts, codecs, bags and networks know it."""
+
+    type: str
+    """Its ROS name, `PACKAGE/msg/NAME`."""
+    message: Late
+    """Its class: a frozen attrs class derived from `Message`."""
+
+    def mistakes(self) -> Iterator[str]:
+        """What is wrong with it, in words for its author."""
+        if not re.fullmatch(r"[a-z]\w*/msg/[A-Z]\w*", self.type):
+            yield f"type {self.type!r} is no name of a message: use PACKAGE/msg/NAME, e.g. my_msgs/msg/Force"
+
+    def load(self) -> builtins.type[Message]:
+        """Import its class.
+
+        Raises:
+            PluginError: if it is no message of this type.
+        """
+        if getattr(kind := self.message.load(), "ros_type", "") != self.type:
+            raise PluginError(f"{self.message.place} is no message of type {self.type}: {kind!r}")
+        return cast("builtins.type[Message]", kind)
 
 
 @attrs.frozen

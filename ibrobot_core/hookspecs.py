@@ -90,6 +90,11 @@ def ibrobot_features() -> Iterable[descriptors.FeatureDescriptor]:  # type: igno
 
 
 @hookspec
+def ibrobot_messages() -> Iterable[descriptors.MessageDescriptor]:  # type: ignore[empty-body]
+    """Message types that this plugin defines."""
+
+
+@hookspec
 def ibrobot_viewers() -> Iterable[descriptors.ViewerDescriptor]:  # type: ignore[empty-body]
     """Viewers."""
 

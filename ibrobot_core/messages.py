@@ -7,11 +7,15 @@ and arrays are numpy.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from ibrobot_core.descriptors import MessageDescriptor
 
 _EQUAL = attrs.cmp_using(eq=np.array_equal)
 _NOTHING: Any = ()
@@ -44,13 +48,18 @@ MODEL_ANSWERS = "/model_answers"
 
 @attrs.frozen
 class Message:
-    """Base of all messages; `ros_type` is the full ROS 2 name."""
+    """Base of all messages. A subclass gives its class keywords, e.g. `class Force(Message, ros_type="…")`."""
 
     ros_type: ClassVar[str] = ""
+    """The full ROS 2 name."""
+    whole: ClassVar[tuple[str, ...]] = ()
+    """The paths to all of its numbers, for observations without `select`."""
+    definition: ClassVar[str] = ""
+    """The text of its `.msg` file, if ROS 2 does not define it."""
 
-    def __init_subclass__(cls, ros_type: str = "") -> None:
-        if ros_type:  # attrs creates each class a second time, without `ros_type`
-            cls.ros_type = ros_type
+    def __init_subclass__(cls, ros_type: str = "", whole: tuple[str, ...] = (), definition: str = "") -> None:
+        if ros_type:  # attrs creates each class a second time, without the keywords
+            cls.ros_type, cls.whole, cls.definition = ros_type, whole, definition
 
 
 @attrs.frozen
@@ -62,21 +71,21 @@ class Header:
 
 
 @attrs.frozen
-class Bool(Message, ros_type="std_msgs/msg/Bool"):
+class Bool(Message, ros_type="std_msgs/msg/Bool", whole=("data",)):
     """std_msgs/msg/Bool."""
 
     data: bool
 
 
 @attrs.frozen
-class Int8(Message, ros_type="std_msgs/msg/Int8"):
+class Int8(Message, ros_type="std_msgs/msg/Int8", whole=("data",)):
     """std_msgs/msg/Int8: -128 to 127."""
 
     data: int
 
 
 @attrs.frozen
-class Int32(Message, ros_type="std_msgs/msg/Int32"):
+class Int32(Message, ros_type="std_msgs/msg/Int32", whole=("data",)):
     """std_msgs/msg/Int32."""
 
     data: int
@@ -107,7 +116,7 @@ class MultiArrayLayout:
 
 
 @attrs.frozen
-class Float32MultiArray(Message, ros_type="std_msgs/msg/Float32MultiArray"):
+class Float32MultiArray(Message, ros_type="std_msgs/msg/Float32MultiArray", whole=("data",)):
     """std_msgs/msg/Float32MultiArray; `data` has shape (N,)."""
 
     data: NDArray[np.float32] = attrs.field(converter=_float32s, eq=_EQUAL)
@@ -115,7 +124,7 @@ class Float32MultiArray(Message, ros_type="std_msgs/msg/Float32MultiArray"):
 
 
 @attrs.frozen
-class Float64MultiArray(Message, ros_type="std_msgs/msg/Float64MultiArray"):
+class Float64MultiArray(Message, ros_type="std_msgs/msg/Float64MultiArray", whole=("data",)):
     """std_msgs/msg/Float64MultiArray; `data` has shape (N,)."""
 
     data: NDArray[np.float64] = attrs.field(converter=_float64s, eq=_EQUAL)
@@ -123,7 +132,7 @@ class Float64MultiArray(Message, ros_type="std_msgs/msg/Float64MultiArray"):
 
 
 @attrs.frozen
-class Int32MultiArray(Message, ros_type="std_msgs/msg/Int32MultiArray"):
+class Int32MultiArray(Message, ros_type="std_msgs/msg/Int32MultiArray", whole=("data",)):
     """std_msgs/msg/Int32MultiArray; `data` has shape (N,)."""
 
     data: NDArray[np.int32] = attrs.field(converter=_int32s, eq=_EQUAL)
@@ -197,7 +206,7 @@ class Quaternion:
 
 
 @attrs.frozen
-class Imu(Message, ros_type="sensor_msgs/msg/Imu"):
+class Imu(Message, ros_type="sensor_msgs/msg/Imu", whole=("orientation", "angular_velocity", "linear_acceleration")):
     """sensor_msgs/msg/Imu: angular velocity [rad/s], linear acceleration [m/s^2]; covariances (9,), row-major."""
 
     header: Header
@@ -210,7 +219,7 @@ class Imu(Message, ros_type="sensor_msgs/msg/Imu"):
 
 
 @attrs.frozen
-class Joy(Message, ros_type="sensor_msgs/msg/Joy"):
+class Joy(Message, ros_type="sensor_msgs/msg/Joy", whole=("axes", "buttons")):
     """sensor_msgs/msg/Joy: `axes` (A,) in -1..1, `buttons` (B,) 0 or 1."""
 
     header: Header
@@ -244,7 +253,7 @@ class PointCloud2(Message, ros_type="sensor_msgs/msg/PointCloud2"):
 
 
 @attrs.frozen
-class Pose(Message, ros_type="geometry_msgs/msg/Pose"):
+class Pose(Message, ros_type="geometry_msgs/msg/Pose", whole=("position", "orientation")):
     """geometry_msgs/msg/Pose: position [m] and orientation."""
 
     position: Vector3 = Vector3()
@@ -252,7 +261,7 @@ class Pose(Message, ros_type="geometry_msgs/msg/Pose"):
 
 
 @attrs.frozen
-class PoseStamped(Message, ros_type="geometry_msgs/msg/PoseStamped"):
+class PoseStamped(Message, ros_type="geometry_msgs/msg/PoseStamped", whole=("pose",)):
     """geometry_msgs/msg/PoseStamped."""
 
     header: Header
@@ -260,7 +269,7 @@ class PoseStamped(Message, ros_type="geometry_msgs/msg/PoseStamped"):
 
 
 @attrs.frozen
-class Twist(Message, ros_type="geometry_msgs/msg/Twist"):
+class Twist(Message, ros_type="geometry_msgs/msg/Twist", whole=("linear", "angular")):
     """geometry_msgs/msg/Twist: linear [m/s], angular [rad/s]."""
 
     linear: Vector3 = Vector3()
@@ -268,7 +277,7 @@ class Twist(Message, ros_type="geometry_msgs/msg/Twist"):
 
 
 @attrs.frozen
-class TwistStamped(Message, ros_type="geometry_msgs/msg/TwistStamped"):
+class TwistStamped(Message, ros_type="geometry_msgs/msg/TwistStamped", whole=("twist",)):
     """geometry_msgs/msg/TwistStamped: along the axes of `header.frame_id`."""
 
     header: Header
@@ -276,7 +285,7 @@ class TwistStamped(Message, ros_type="geometry_msgs/msg/TwistStamped"):
 
 
 @attrs.frozen
-class TransformStamped(Message, ros_type="geometry_msgs/msg/TransformStamped"):
+class TransformStamped(Message, ros_type="geometry_msgs/msg/TransformStamped", whole=("translation", "rotation")):
     """geometry_msgs/msg/TransformStamped: `child_frame_id` as seen from `header.frame_id`."""
 
     header: Header
@@ -392,9 +401,47 @@ class ModelAnswer(Message, ros_type="ibrobot_msgs/msg/ModelAnswer"):
     actions: NDArray[np.float64] = attrs.field(converter=_float64s, eq=_EQUAL)
 
 
-MESSAGE_TYPES: dict[str, type[Message]] = {
-    each.ros_type: each
-    for each in tuple(globals().values())
-    if isinstance(each, type) and issubclass(each, Message) and each.ros_type
-}
+class MessageTypes(Mapping[str, type[Message]]):
+    """Message classes by ROS 2 name: those of core, then those that installed plugins define."""
+
+    def __init__(self, own: Mapping[str, type[Message]]) -> None:
+        self._own = own
+        self._asking = False
+
+    def __getitem__(self, name: str) -> type[Message]:
+        """The class; asks plugins only for a type that core lacks."""
+        return self._own[name] if name in self._own else self._of_plugins()[name].load()
+
+    def __contains__(self, name: object) -> bool:
+        """Whether there is one; imports no class."""
+        return name in self._own or name in self._of_plugins()
+
+    def __iter__(self) -> Iterator[str]:
+        """All names."""
+        return iter(dict.fromkeys((*self._own, *self._of_plugins())))
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return sum(1 for _ in self)
+
+    def _of_plugins(self) -> Mapping[str, MessageDescriptor]:
+        """Discovers the plugins. One that asks while it is loaded sees only core's types."""
+        from ibrobot_core.plugins import installed_plugins
+
+        if self._asking:
+            return {}
+        self._asking = True
+        try:
+            return installed_plugins().messages
+        finally:
+            self._asking = False
+
+
+MESSAGE_TYPES = MessageTypes(
+    {
+        each.ros_type: each
+        for each in tuple(globals().values())
+        if isinstance(each, type) and issubclass(each, Message) and each.ros_type
+    }
+)
 """Every message class by its ROS 2 name."""

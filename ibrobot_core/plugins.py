@@ -52,7 +52,7 @@ KINDS: Mapping[str, str] = {
     "section": "ibrobot_sections",
 }
 """Plugin kind -> its registration hook."""
-_UNTYPED = tuple(f"ibrobot_{name}s" for name in ("reader", "decoder", "feature", "config", "command"))
+_UNTYPED = tuple(f"ibrobot_{name}s" for name in ("reader", "decoder", "feature", "message", "config", "command"))
 """Registration hooks for objects that the YAML does not name by `type`."""
 
 OFFICIAL = Path(__file__).with_name("official_plugins.json")
@@ -107,6 +107,8 @@ class Registry:
     readers: list[descriptors.ReaderDescriptor] = attrs.field(factory=list)
     decoders: list[descriptors.DecoderDescriptor] = attrs.field(factory=list)
     features: dict[str, descriptors.FeatureDescriptor] = attrs.field(factory=dict)
+    messages: dict[str, descriptors.MessageDescriptor] = attrs.field(factory=dict)
+    """Message types that plugins define, by ROS name."""
     kinds: dict[str, descriptors.Kind] = attrs.field(factory=dict)
     """The kinds that plugins define; `KINDS` has those of core."""
     commands: dict[str, descriptors.Command] = attrs.field(factory=dict)
@@ -355,7 +357,8 @@ def _offered(manager: pluggy.PluginManager, hook: str, expected: type[Any] | Non
         for field in attrs.fields(type(each)):
             if not isinstance(value := getattr(each, field.name), _CLASSES.get(field.type, object)):
                 raise TypeError(f"{expected.__name__}.{field.alias} must be a {field.type}, not {value!r}")
-        for mistake in each.mistakes() if isinstance(each, descriptors.Descriptor) else ():
+        described = isinstance(each, descriptors.Descriptor | descriptors.MessageDescriptor)
+        for mistake in each.mistakes() if described else ():
             raise TypeError(f"{expected.__name__} {each.type!r}: {mistake}")
     ((plugin, _),) = manager.list_name_plugin()
     return [attrs.evolve(each, **_contained(each, f"plugin {plugin!r} failed in %s of {hook}: %s")) for each in offers]
@@ -443,6 +446,9 @@ class _Plugin:
                 registry.command_packages[each.name] = self.package
             else:
                 self.double(registry, "command", each.name, registry.command_packages[each.name], "ibrobot_commands")
+        for each in offers["ibrobot_messages"]:
+            if registry.messages.setdefault(each.type, each) is not each:
+                self.refuse(registry, f"message type {each.type} is defined already", "ibrobot_messages")
         registry.features |= {each.name: each for each in offers["ibrobot_features"]}
         registry.managers[self.name] = self.manager
 

@@ -16,10 +16,12 @@ import attrs
 from ibrobot_core.component_config import ComponentConfig, NamedComponentConfig, component_of
 from ibrobot_core.deadman import HOLD_S
 from ibrobot_core.errors import PluginNotInstalled
+from ibrobot_core.messages import Image
 from ibrobot_core.options import documented, fields, not_a_key, option
 from ibrobot_core.robot import Robot
 from ibrobot_core.units import NORM_MODES
 
+_CAMERA_TOPIC = "/camera/{name}/image_raw"
 _UNIT = 1e-3
 """Tolerance for the length of a quaternion, which may be rounded."""
 
@@ -84,6 +86,15 @@ class PeripheralConfig(ComponentConfig):
     sim: Mapping[str, Any] = option(factory=dict, help="further options for the simulated sensor")
     picture: tuple[int, int] | None = not_a_key(None)
     """Height and width of its images [px], if the options determine them."""
+    topic: str = not_a_key(attrs.Factory(lambda self: _CAMERA_TOPIC if self.kind == "camera" else "", takes_self=True))
+    """Topic of its messages, with `{name}` for its name; empty if only its options say it."""
+    message: str = not_a_key(Image.ros_type)
+    """ROS type of its messages."""
+
+    @property
+    def published(self) -> str:
+        """The topic of its messages; empty if only its options say it."""
+        return self.topic.format(name=self.name)
 
 
 @attrs.frozen

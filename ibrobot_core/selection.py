@@ -17,17 +17,6 @@ from ibrobot_core.errors import ContractError
 from ibrobot_core.messages import MESSAGE_TYPES, JointState, Message
 from ibrobot_core.options import did_you_mean
 
-_WHOLE: dict[str, tuple[str, ...]] = {
-    "sensor_msgs/msg/Imu": ("orientation", "angular_velocity", "linear_acceleration"),
-    "sensor_msgs/msg/Joy": ("axes", "buttons"),
-    "geometry_msgs/msg/Pose": ("position", "orientation"),
-    "geometry_msgs/msg/PoseStamped": ("pose",),
-    "geometry_msgs/msg/Twist": ("linear", "angular"),
-    "geometry_msgs/msg/TwistStamped": ("twist",),
-    "geometry_msgs/msg/TransformStamped": ("translation", "rotation"),
-    **{f"std_msgs/msg/{name}": ("data",) for name in ("Bool", "Int8", "Int32")},
-    **{f"std_msgs/msg/{name}MultiArray": ("data",) for name in ("Float32", "Float64", "Int32")},
-}
 _LEROBOT_SUFFIX = {"position": "pos", "velocity": "vel", "effort": "eff"}
 
 _NONE: Mapping[str, Any] = {}
@@ -135,10 +124,10 @@ class Selection:
 def _default(message_type: type[Message], joints: Sequence[str]) -> tuple[str, ...]:
     if message_type is JointState:
         return tuple(f"position.{joint}" for joint in joints)
-    if message_type.ros_type not in _WHOLE:
+    if not message_type.whole:
         first = attrs.fields(message_type)[0].name
         raise ContractError(f"{message_type.ros_type} needs a select: paths to its numbers, e.g. {first}")
-    return _WHOLE[message_type.ros_type]
+    return message_type.whole
 
 
 def _resolve(message_type: type[Any], path: str) -> list[Leaf]:

@@ -16,13 +16,8 @@ from ibrobot_core.descriptors import StreamOptions
 from ibrobot_core.errors import ContractError
 from ibrobot_core.options import did_you_mean
 from ibrobot_core.plugins import installed_plugins
-from ibrobot_core.schema import TASK_KEY, ActionSpec, ContractConfig, ExecutorConfig, ObservationSpec, SignalSpec
+from ibrobot_core.schema import TASK_KEY, ActionSpec, ContractConfig, ExecutorConfig, ObservationSpec, PeripheralConfig, SignalSpec
 from ibrobot_core.selection import Selection
-
-PERIPHERAL_TOPICS: Mapping[str, tuple[str, type[messages.Message]]] = {
-    "camera": ("/camera/{name}/image_raw", messages.Image)
-}
-"""Peripheral kind -> topic and type of its messages."""
 
 SIGNAL_TYPES: Mapping[str, str] = {
     TASK_KEY: messages.String.ros_type,
@@ -38,11 +33,10 @@ _NO_FEATURE = "{0!r} is computed by no installed plugin; paths into messages are
 _JOINT_FIELDS = ("position", "velocity", "effort")
 
 
-def completed(spec: ObservationSpec, kind: str = "") -> ObservationSpec:
-    """Complete an observation with the topic and type implied by its peripheral, of this kind, or by its topic."""
-    if spec.peripheral is not None and kind in PERIPHERAL_TOPICS:
-        topic, message_type = PERIPHERAL_TOPICS[kind]
-        return attrs.evolve(spec, topic=topic.format(name=spec.peripheral), type=message_type.ros_type)
+def completed(spec: ObservationSpec, peripheral: PeripheralConfig | None = None) -> ObservationSpec:
+    """Complete an observation with the topic and type of its peripheral, or with the type implied by its topic."""
+    if peripheral is not None and peripheral.topic:
+        return attrs.evolve(spec, topic=peripheral.published, type=peripheral.message)
     if spec.topic == messages.JOINT_STATES and not spec.type:
         return attrs.evolve(spec, type=messages.JointState.ros_type)
     return spec
@@ -134,11 +128,15 @@ class ContractChecks:
         if not self.document.refer((*key, "peripheral"), str(spec.peripheral), list(kinds), "peripheral"):
             return spec
         kind = kinds[str(spec.peripheral)]
-        if kind not in PERIPHERAL_TOPICS:
-            message = f"a peripheral of kind {kind!r} does not determine topic and type; give them instead"
-            self.document.add((*key, "peripheral"), message)
+        part = self.sections.peripherals.get(str(spec.peripheral))
+        without_plugin = PeripheralConfig(type="", options=None, name=str(spec.peripheral), kind=kind)
+        peripheral = part.component if part is not None else without_plugin
+        if not peripheral.topic:
+            if part is not None:  # otherwise its own fault is reported
+                message = f"a peripheral of kind {kind!r} does not determine topic and type; give them instead"
+                self.document.add((*key, "peripheral"), message)
             return spec
-        spec = completed(spec, kind)
+        spec = completed(spec, peripheral)
         self._fits(key, spec)
         return spec
 

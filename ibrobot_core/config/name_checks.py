@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from ibrobot_core.config.contract_checks import PERIPHERAL_TOPICS
 from ibrobot_core.config.structure import ParsedSections
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.messages import RUN_TOPICS
@@ -28,6 +27,6 @@ def _publishers(sections: ParsedSections) -> dict[str, str]:
     publishers = dict.fromkeys(RUN_TOPICS, "every run")
     publishers |= {spec.topic: "the actions of the contract" for spec in (contract.actions if contract else ())}
     for name, part in sections.peripherals.items():
-        if part.component.kind in PERIPHERAL_TOPICS:
-            publishers[PERIPHERAL_TOPICS[part.component.kind][0].format(name=name)] = f"peripheral {name}"
+        if topic := part.component.published:
+            publishers[topic] = f"peripheral {name}"
     return publishers

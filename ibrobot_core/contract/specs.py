@@ -247,7 +247,7 @@ class Contract:
 def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
     """The observation part of a spec, with paths and shape."""
     peripheral = config.peripherals[spec.peripheral] if spec.peripheral is not None else None
-    spec = completed(spec, peripheral.kind if peripheral is not None else "")
+    spec = completed(spec, peripheral)
     # The type of image message does not affect data.
     type_ = Image.ros_type if spec.type == CompressedImage.ros_type else spec.type
     known = MESSAGE_TYPES.get(type_)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from ibrobot_core.config import RobotConfig
-from ibrobot_core.config.contract_checks import PERIPHERAL_TOPICS
 from ibrobot_core.errors import MissingDependency, PluginNotInstalled
 from ibrobot_core.interfaces.run_state import AbsentSensor
 from ibrobot_core.plugins import Registry
@@ -25,10 +24,9 @@ def absent_sensors(config: RobotConfig, registry: Registry) -> tuple[AbsentSenso
             missing = MissingDependency(error.missing, remedy=error.remedy)
         if missing is None:
             continue
-        if peripheral.kind not in PERIPHERAL_TOPICS:
+        if not peripheral.published:
             raise missing
-        topic, _ = PERIPHERAL_TOPICS[peripheral.kind]
-        absent.append(AbsentSensor(name, f"{peripheral.kind} {name}", topic.format(name=name), missing))
+        absent.append(AbsentSensor(name, f"{peripheral.kind} {name}", peripheral.published, missing))
     return tuple(absent)
 
 

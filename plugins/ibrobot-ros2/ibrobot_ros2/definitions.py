@@ -10,7 +10,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from ibrobot_core.api import IbrobotError
+from ibrobot_core.api import MESSAGE_TYPES, IbrobotError
 
 _PACKAGE = "ibrobot_msgs"
 _SEPARATOR = "=" * 80 + "\n"
@@ -168,11 +168,13 @@ def type_hash(type_name: str, types: Typestore | None = None) -> str:
 
 
 def known(type_name: str, types: Typestore) -> Typestore:
-    """The types, if a type is among them.
+    """The types, if a type is among them, or a plugin defines it.
 
     Raises:
         CodecError: if it is not.
     """
+    if type_name not in types.fielddefs and type_name in MESSAGE_TYPES:
+        define(types, type_name, MESSAGE_TYPES[type_name].definition)
     if type_name not in types.fielddefs:
         raise CodecError(f"{type_name}: this message type is not defined")
     return types
