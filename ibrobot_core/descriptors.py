@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal
 
 import attrs
 
@@ -181,9 +181,12 @@ class MessageDescriptor:
         Raises:
             PluginError: if it is no message of this type.
         """
-        if getattr(kind := self.message.load(), "ros_type", "") != self.type:
+        from ibrobot_core.messages import Message
+
+        kind = self.message.load()
+        if not (isinstance(kind, type) and issubclass(kind, Message) and kind.ros_type == self.type):
             raise PluginError(f"{self.message.place} is no message of type {self.type}: {kind!r}")
-        return cast("builtins.type[Message]", kind)
+        return kind
 
 
 @attrs.frozen

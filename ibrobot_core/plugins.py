@@ -63,7 +63,7 @@ RECORDS = "records"
 EXTRAS = Path(__file__).with_name("official_extras.json")
 """Extra of `ibrobot` -> the packages that it installs. `python tests/house/official_plugins.py` writes it."""
 
-_CLASSES = {"str": str, "Path": Path, "builtins.type[Any]": type}
+_CLASSES = {"str": str, "Path": Path, "builtins.type[Any]": type, "Late": descriptors.Late}
 """Annotation -> class, for the fields of descriptors that commands read even if they use nothing of the plugin."""
 _NOT_THEIRS: Mapping[str, object] = {"reads": False, "takes": "", "without_section": False, "questions": ()}
 """Function of a descriptor that is asked about any file or robot -> its answer for what is not the plugin's."""

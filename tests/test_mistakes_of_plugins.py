@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ibrobot_core.config import load_config
-from ibrobot_core.errors import ConfigError, PluginError
+from ibrobot_core.errors import ConfigError, ContractError, PluginError
+from ibrobot_core.messages import MESSAGE_TYPES
 from ibrobot_core.plugins import discover
+from ibrobot_core.selection import Selection
 
 if TYPE_CHECKING:
     from ibrobot_testing.site import Site
@@ -73,6 +75,72 @@ def test_mistake_is_named_with_its_package(site: Site, tmp_path: Path, mistake: 
     assert str(failure).startswith("plugin 'fake_wave' (fake-wave) ")
     with pytest.raises(PluginError, match="fake-wave"):  # where it is asked for
         registry.find("teleop", "wave")
+
+
+MESSAGE = """
+import attrs
+from ibrobot_core.api import Header, Late, Message, MessageDescriptor, hookimpl
+
+
+@attrs.frozen
+class Touch(Message, ros_type="skin_msgs/msg/Touch", definition="std_msgs/Header header\\nfloat32 force\\n"):
+    header: Header = Header()
+    force: float = 0.0
+
+
+@hookimpl
+def ibrobot_messages():
+    yield MessageDescriptor("skin_msgs/msg/Touch", Late("fake_skin:Touch"))
+"""
+WRONG_MESSAGES = {
+    "name without a package": (
+        '"skin_msgs/msg/Touch", Late',
+        '"Touch", Late',
+        "type 'Touch' is no name of a message: use",
+    ),
+    "class instead of its place": ('Late("fake_skin:Touch")', "Touch", "MessageDescriptor.message must be a Late, not"),
+}
+
+
+@pytest.mark.parametrize("mistake", WRONG_MESSAGES)
+def test_wrong_message_type_is_named_with_its_package(site: Site, tmp_path: Path, mistake: str) -> None:
+    right, wrong, reason = WRONG_MESSAGES[mistake]
+    assert right in MESSAGE
+    offer(site, tmp_path, MESSAGE.replace(right, wrong), "fake-skin")
+    (failure,) = discover(site.entry_points()).failures
+    assert str(failure).startswith("plugin 'fake_skin' (fake-skin) ")
+    assert reason in str(failure)
+
+
+def test_class_of_another_type_is_refused_where_it_is_needed(site: Site, tmp_path: Path) -> None:
+    offer(
+        site,
+        tmp_path,
+        MESSAGE.replace('Descriptor("skin_msgs/msg/Touch"', 'Descriptor("skin_msgs/msg/Push"'),
+        "fake-skin",
+    )
+    with pytest.raises(PluginError, match=r"fake_skin:Touch is no message of type skin_msgs/msg/Push"):
+        MESSAGE_TYPES["skin_msgs/msg/Push"]
+
+
+def test_two_packages_that_define_one_message_type_are_named(site: Site, tmp_path: Path) -> None:
+    offer(site, tmp_path, MESSAGE, "fake-skin")
+    offer(site, tmp_path, MESSAGE, "other-skin")
+    (failure,) = discover(site.entry_points()).failures
+    assert "message type skin_msgs/msg/Touch is defined already" in str(failure)
+    assert "(other-skin)" in str(failure)
+
+
+def test_message_type_of_a_plugin_is_known_as_those_of_core_are(site: Site, tmp_path: Path) -> None:
+    offer(site, tmp_path, MESSAGE, "fake-skin")
+    assert "skin_msgs/msg/Touch" in MESSAGE_TYPES
+    assert "skin_msgs/msg/Touch" in [*MESSAGE_TYPES]
+    touch = MESSAGE_TYPES["skin_msgs/msg/Touch"](force=0.5)
+    assert Selection(touch.ros_type, ["force"])(touch) == 0.5
+    with pytest.raises(ContractError, match=r"Touch has no field 'farce'.*did you mean 'force'"):
+        Selection(touch.ros_type, ["farce"])
+    with pytest.raises(ContractError, match="needs a select: paths to its numbers"):
+        Selection(touch.ros_type)
 
 
 def test_plugin_without_mistakes_is_used(site: Site, tmp_path: Path) -> None:

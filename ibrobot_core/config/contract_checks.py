@@ -16,7 +16,15 @@ from ibrobot_core.descriptors import StreamOptions
 from ibrobot_core.errors import ContractError
 from ibrobot_core.options import did_you_mean
 from ibrobot_core.plugins import installed_plugins
-from ibrobot_core.schema import TASK_KEY, ActionSpec, ContractConfig, ExecutorConfig, ObservationSpec, PeripheralConfig, SignalSpec
+from ibrobot_core.schema import (
+    TASK_KEY,
+    ActionSpec,
+    ContractConfig,
+    ExecutorConfig,
+    ObservationSpec,
+    PeripheralConfig,
+    SignalSpec,
+)
 from ibrobot_core.selection import Selection
 
 SIGNAL_TYPES: Mapping[str, str] = {
@@ -130,7 +138,7 @@ class ContractChecks:
         kind = kinds[str(spec.peripheral)]
         part = self.sections.peripherals.get(str(spec.peripheral))
         without_plugin = PeripheralConfig(type="", options=None, name=str(spec.peripheral), kind=kind)
-        peripheral = part.component if part is not None else without_plugin
+        peripheral = part.component if part is not None and part.component.kind == kind else without_plugin
         if not peripheral.topic:
             if part is not None:  # otherwise its own fault is reported
                 message = f"a peripheral of kind {kind!r} does not determine topic and type; give them instead"

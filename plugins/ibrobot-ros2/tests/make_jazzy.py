@@ -3,7 +3,7 @@
 Not a test. Run in an environment of its own, Python 3.12:
 
     pip install ros-jazzy-rclpy ros-jazzy-rmw-fastrtps-cpp ros-jazzy-std-msgs ros-jazzy-sensor-msgs \
-        ros-jazzy-geometry-msgs ros-jazzy-trajectory-msgs ros-jazzy-diagnostic-msgs numpy
+        ros-jazzy-geometry-msgs ros-jazzy-trajectory-msgs ros-jazzy-diagnostic-msgs ros-jazzy-nav-msgs numpy
     python make_jazzy.py > jazzy.json
 
 Every field has a value; sequences have 0, 1, 2 and 3 elements. What core's messages leave out is zero.
@@ -21,8 +21,35 @@ from rclpy.serialization import serialize_message
 
 TYPES = {
     "std_msgs": ("Bool", "Int8", "Int32", "String", "Float32MultiArray", "Float64MultiArray", "Int32MultiArray"),
-    "sensor_msgs": ("JointState", "Image", "CompressedImage", "CameraInfo", "Imu", "Joy", "PointCloud2"),
-    "geometry_msgs": ("Pose", "PoseStamped", "Twist", "TwistStamped", "TransformStamped"),
+    "sensor_msgs": (
+        "JointState",
+        "Image",
+        "CompressedImage",
+        "CameraInfo",
+        "Imu",
+        "Joy",
+        "PointCloud2",
+        "Range",
+        "Temperature",
+        "FluidPressure",
+        "MagneticField",
+        "BatteryState",
+        "LaserScan",
+        "NavSatStatus",
+        "NavSatFix",
+    ),
+    "geometry_msgs": (
+        "Pose",
+        "PoseStamped",
+        "Twist",
+        "TwistStamped",
+        "TransformStamped",
+        "Wrench",
+        "WrenchStamped",
+        "PoseWithCovariance",
+        "TwistWithCovariance",
+    ),
+    "nav_msgs": ("Odometry",),
     "trajectory_msgs": ("JointTrajectory",),
     "diagnostic_msgs": ("DiagnosticArray",),
 }

@@ -14,6 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from ibrobot_ros2 import Codec, CodecError, decode, definition, encode, type_hash
+from ibrobot_ros2.definitions import standard_types
+from ibrobot_sensor_messages.messages import SENSOR_MESSAGES
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ibrobot_core import api
@@ -39,6 +42,27 @@ RANGES = {
 UNSIGNED = (0, 2**32 - 1)
 
 
+type_hash("ibrobot_msgs/msg/AudioBlock")  # from here on it is among the standard types
+
+
+def bounds(cls: type, name: str) -> tuple[int, int]:
+    """What an integer field of a type that plugins define can hold, by its definition."""
+    fields = dict(standard_types().fielddefs[cls.ros_type][1])
+    info = np.iinfo(fields[name][1][0])
+    return int(info.min), int(info.max)
+
+
+def is_single(cls: type, name: str) -> bool:
+    """Whether a field has single precision."""
+    return dict(standard_types().fielddefs[cls.ros_type][1]).get(name, (0, ("",)))[1][0] == "float32"
+
+
+def length_of(cls: type, name: str) -> int | None:
+    """Length of an array of such a type; None if it may vary."""
+    kind, (_, length) = dict(standard_types().fielddefs[cls.ros_type][1])[name]
+    return length if kind == Nodetype.ARRAY else None
+
+
 def of_class(cls: type) -> st.SearchStrategy:
     hints = typing.get_type_hints(cls)
     return st.builds(cls, **{f.name: of_field(cls, f.name, hints[f.name]) for f in attrs.fields(cls)})
@@ -53,11 +77,20 @@ def of_field(cls: type, name: str, hint: Any) -> st.SearchStrategy:
         dtype = typing.get_args(hint)[-1]
         dtype = (typing.get_args(dtype) or (dtype,))[0]  # numpy.dtype[…] in older versions of NumPy
         length = FIXED.get(name) if cls in (CameraInfo, Imu) else None
+        if cls in SENSOR_MESSAGES:
+            length = length_of(cls, name)
         return hnp.arrays(dtype, length if length is not None else st.integers(0, 5))
     if hint is int:
         low, high = RANGES.get(getattr(cls, "ros_type", ""), RANGES.get(name, UNSIGNED))
+        if cls in SENSOR_MESSAGES:
+            low, high = bounds(cls, name)
         return STAMP if name.endswith("_ns") else st.integers(low, high)
-    plain = {bool: st.booleans(), float: st.floats(allow_nan=False), str: st.text(st.characters(codec="utf-8"))}
+    width = 32 if cls in SENSOR_MESSAGES and is_single(cls, name) else 64
+    plain = {
+        bool: st.booleans(),
+        float: st.floats(allow_nan=False, width=width),
+        str: st.text(st.characters(codec="utf-8")),
+    }
     return plain[hint]
 
 

@@ -19,6 +19,7 @@ NOT_THERE = {
     "tf2_msgs/msg/TFMessage",
     "ibrobot_msgs/msg/RobotStatus",
     "ibrobot_msgs/msg/ModelAnswer",
+    "ibrobot_msgs/msg/AudioBlock",
 }
 """Types that its packages from wheels do not have."""
 
