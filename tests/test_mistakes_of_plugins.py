@@ -96,7 +96,7 @@ WRONG_MESSAGES = {
     "name without a package": (
         '"skin_msgs/msg/Touch", Late',
         '"Touch", Late',
-        "type 'Touch' is no name of a message: use",
+        "type 'Touch' is no name of a message",
     ),
     "class instead of its place": ('Late("fake_skin:Touch")', "Touch", "MessageDescriptor.message must be a Late, not"),
 }

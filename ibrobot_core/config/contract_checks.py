@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import attrs
 
-from ibrobot_core import messages
+from ibrobot_core import messages, schema
 from ibrobot_core.config.checks import streams
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document
@@ -16,15 +16,7 @@ from ibrobot_core.descriptors import StreamOptions
 from ibrobot_core.errors import ContractError
 from ibrobot_core.options import did_you_mean
 from ibrobot_core.plugins import installed_plugins
-from ibrobot_core.schema import (
-    TASK_KEY,
-    ActionSpec,
-    ContractConfig,
-    ExecutorConfig,
-    ObservationSpec,
-    PeripheralConfig,
-    SignalSpec,
-)
+from ibrobot_core.schema import TASK_KEY, ActionSpec, ContractConfig, ExecutorConfig, ObservationSpec, SignalSpec
 from ibrobot_core.selection import Selection
 
 SIGNAL_TYPES: Mapping[str, str] = {
@@ -41,7 +33,7 @@ _NO_FEATURE = "{0!r} is computed by no installed plugin; paths into messages are
 _JOINT_FIELDS = ("position", "velocity", "effort")
 
 
-def completed(spec: ObservationSpec, peripheral: PeripheralConfig | None = None) -> ObservationSpec:
+def completed(spec: ObservationSpec, peripheral: schema.PeripheralConfig | None = None) -> ObservationSpec:
     """Complete an observation with the topic and type of its peripheral, or with the type implied by its topic."""
     if peripheral is not None and peripheral.topic:
         return attrs.evolve(spec, topic=peripheral.published, type=peripheral.message)
@@ -137,7 +129,7 @@ class ContractChecks:
             return spec
         kind = kinds[str(spec.peripheral)]
         part = self.sections.peripherals.get(str(spec.peripheral))
-        without_plugin = PeripheralConfig(type="", options=None, name=str(spec.peripheral), kind=kind)
+        without_plugin = schema.PeripheralConfig(type="", options=None, name=str(spec.peripheral), kind=kind)
         peripheral = part.component if part is not None and part.component.kind == kind else without_plugin
         if not peripheral.topic:
             if part is not None:  # otherwise its own fault is reported
