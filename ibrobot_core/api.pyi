@@ -65,15 +65,6 @@ from ibrobot_core.interfaces.hardware import (
 from ibrobot_core.interfaces.teleop import Approach as Approach
 from ibrobot_core.deadman import Deadman as Deadman
 
-# Calibration
-from ibrobot_core.calibration import (
-    Calibration as Calibration,
-    JointCalibration as JointCalibration,
-    calibration_path as calibration_path,
-    companion_path as companion_path,
-    load_calibration as load_calibration,
-)
-
 # Models
 from ibrobot_core.interfaces import (
     Policy as Policy,
@@ -124,7 +115,6 @@ from ibrobot_core.contract.specs import (
     ObservationPart as ObservationPart,
     ActionPart as ActionPart,
 )
-from ibrobot_core.contract.joint_units import JointUnits as JointUnits
 from ibrobot_core.contract.image import pixels as pixels
 
 # Errors

@@ -7,6 +7,7 @@ from ibrobot_core.descriptors import (
     Kind as Kind,
     SourceDescriptor as SourceDescriptor,
     TerminalDescriptor as TerminalDescriptor,
+    UnitsDescriptor as UnitsDescriptor,
     ConfigFile as ConfigFile,
     FeatureDescriptor as FeatureDescriptor,
 )
@@ -23,6 +24,7 @@ from ibrobot_core.schema import (
     ControlMode as ControlMode,
     ExecutorConfig as ExecutorConfig,
     RecordingConfig as RecordingConfig,
+    ModelConfig as ModelConfig,
     TransportConfig as TransportConfig,
     Mount as Mount,
     Align as Align,
@@ -127,11 +129,7 @@ from ibrobot_core.selection import (
     value_at as value_at,
 )
 from ibrobot_core.contract.specs import SignalPart as SignalPart
-from ibrobot_core.contract.joint_units import (
-    calibrations as calibrations,
-    with_closed_ends as with_closed_ends,
-    policy_units as policy_units,
-)
+from ibrobot_core.contract.vectors import PolicyVectors as PolicyVectors
 from ibrobot_core.units import NORM_MODES as NORM_MODES
 
 # Commands

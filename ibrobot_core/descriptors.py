@@ -18,11 +18,12 @@ if TYPE_CHECKING:
     from ibrobot_core import interfaces
     from ibrobot_core.component import Component, SourceWorker, TransportLink
     from ibrobot_core.component_config import ComponentConfig
+    from ibrobot_core.errors import Problem
     from ibrobot_core.events import Event
     from ibrobot_core.interfaces.run import RunAccess, RunView
     from ibrobot_core.messages import CompressedImage, Image, Message
     from ibrobot_core.robot import Robot
-    from ibrobot_core.schema import RobotConfig
+    from ibrobot_core.schema import ModelConfig, RobotConfig
     from ibrobot_core.selection import JointFeature
 
 
@@ -82,8 +83,7 @@ class Descriptor[T]:
     publishes: Callable[[Any], Iterable[OptionName]] = _answer(())
     """The topics that options name and the component publishes, which nothing else may publish."""
     calibration: Callable[[Any], str | None] = _answer(None)
-    """Name or path of the calibration in the options, for `load_calibration`; recordings contain that of hardware. None
-    without a calibration."""
+    """Name or path of the calibration in the options, None without one; recordings contain that of hardware."""
     tool: str | None = attrs.field(default=None, kw_only=True)
     """The command that has `calibrate` and `import` for its calibrations, for messages."""
     offers: Callable[[Any, str], bool] = _answer(False)
@@ -304,6 +304,16 @@ class TerminalDescriptor(Descriptor[Any]):
 
 
 @attrs.frozen
+class UnitsDescriptor(Descriptor[Any]):
+    """Units of policies other than radians, `norm_mode` of a model, and features of their actions."""
+
+    make: Callable[[RobotConfig, ModelConfig, Any], Any] = attrs.field(kw_only=True)  # type: ignore[assignment]
+    """Robot, model and `Contract` -> the `PolicyVectors`, which convert. Raises CalibrationError."""
+    uncalibrated: Callable[[RobotConfig], Iterable[Problem]] = _answer(())
+    """Yields what is wrong with the calibrations that a run needs at its start."""
+
+
+@attrs.frozen
 class SectionDescriptor(Descriptor["Component"]):
     """A section that a plugin adds to the robot YAML, e.g. `counter: {topic: /count}`, and its component.
 
@@ -381,7 +391,7 @@ class FeatureDescriptor:
     make: Callable[[Mapping[str, Any], Sequence[str], Sequence[str]], JointFeature]
     """Model, paths, and for an action the joints that it moves -> the numbers. Raises ContractError."""
     vectors: Callable[..., Any]
-    """The subclass of `JointUnits` that converts vectors of contracts whose actions have such paths."""
+    """The class that converts vectors of contracts whose actions have such paths, for what offers `ibrobot_units`."""
     check_config: Callable[[RobotConfig], Iterable[OptionFault]] = _answer(())
     """As `SectionDescriptor.check_config`."""
 

@@ -105,6 +105,11 @@ def ibrobot_terminals() -> Iterable[descriptors.TerminalDescriptor]:  # type: ig
 
 
 @hookspec
+def ibrobot_units() -> Iterable[descriptors.UnitsDescriptor]:  # type: ignore[empty-body]
+    """Units of policies other than radians."""
+
+
+@hookspec
 def ibrobot_sections() -> Iterable[descriptors.SectionDescriptor]:  # type: ignore[empty-body]
     """Sections that this plugin adds to the robot YAML."""
 

@@ -49,6 +49,7 @@ KINDS: Mapping[str, str] = {
     "recorder": "ibrobot_recorders",
     "viewer": "ibrobot_viewers",
     "terminal": "ibrobot_terminals",
+    "units": "ibrobot_units",
     "section": "ibrobot_sections",
 }
 """Plugin kind -> its registration hook."""

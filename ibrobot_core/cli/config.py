@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 
 import attrs
 
-from ibrobot_core.calibration import load_calibration
 from ibrobot_core.cli.options import ConfigOptions
-from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.missing import absent_models, describe, unavailable_modes
-from ibrobot_core.errors import CalibrationError, ConfigError, PluginError, Problem, Unsuccessful
+from ibrobot_core.descriptors import UnitsDescriptor
+from ibrobot_core.errors import ConfigError, PluginError, Unsuccessful
 from ibrobot_core.options import option
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.safe_output import echo
-from ibrobot_core.schema import HardwareConfig, TeleopConfig
 
 
 @attrs.frozen(kw_only=True)
@@ -54,7 +51,8 @@ class CheckConfig(ShowConfig):
             robot = self.load(self.mode)
             modes = [name for name in robot.control_modes if name not in robot.unavailable]
             models = check_models(robot, installed_plugins(), modes) if self.deep else []
-            uncalibrated = list(_uncalibrated(robot))
+            units = [each for each in installed_plugins().of_kind("units") if isinstance(each, UnitsDescriptor)]
+            uncalibrated = [problem for each in units for problem in each.uncalibrated(robot)]
             if self.deep and uncalibrated:
                 raise ConfigError(uncalibrated)
         except ConfigError as error:
@@ -75,21 +73,3 @@ class CheckConfig(ShowConfig):
         notes += [f"{problem.path}: {problem.message}" for problem in uncalibrated]
         for line in (*(f"note: {note}" for note in notes), *models):
             echo(line)
-
-
-def _uncalibrated(config: RobotConfig) -> Iterator[Problem]:
-    """What is wrong with the calibrations that a run needs at its start; this machine may not be the robot's."""
-    limits = {joint.name: (joint.lower, joint.upper) for joint in config.robot.joints}
-    mode = config.control_modes[config.default_control_mode]
-    used = {*mode.devices.values(), *(mode.inference.devices.values() if mode.inference is not None else ())}
-    parts: list[tuple[str, HardwareConfig | TeleopConfig]] = [
-        ("hardware" if name == "hardware" else f"hardware.{name}", each) for name, each in config.hardware.items()
-    ]
-    parts += [(f"teleoperation.{name}", each) for name, each in config.teleoperation.items() if name in used]
-    for path, part in parts:
-        try:
-            if part.calibration is not None:
-                joints = part.joints if isinstance(part, HardwareConfig) else None
-                load_calibration(part.calibration, joints, tool=part.tool).check_ranges(limits, config.closed_ends)
-        except CalibrationError as error:
-            yield Problem(config.source, 0, path, str(error))

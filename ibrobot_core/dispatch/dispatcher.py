@@ -10,8 +10,8 @@ import numpy as np
 
 from ibrobot_core.bus import Bus
 from ibrobot_core.contract.frames import FrameSampler
-from ibrobot_core.contract.joint_units import JointUnits
 from ibrobot_core.contract.specs import Contract
+from ibrobot_core.contract.vectors import PolicyVectors
 from ibrobot_core.dispatch.latency import LatencyEstimate
 from ibrobot_core.dispatch.resume import LeadIn
 from ibrobot_core.dispatch.smoother import TemporalSmoother
@@ -79,7 +79,7 @@ class Dispatcher:
     def __init__(
         self, contract: Contract, spec: PolicySpec, options: DispatchConfig, robot: Robot, bus: Bus,
         client: InferenceClient, send: SendPlan, request_timeout_s: float, prompt: str = "",
-        units: JointUnits | None = None, report: Report = lambda *_: None,
+        units: PolicyVectors | None = None, report: Report = lambda *_: None,
         position: Callable[[], Vector] | None = None,
     ) -> None:  # fmt: skip
         check_strategy(options, spec)
@@ -92,7 +92,7 @@ class Dispatcher:
         self._report = report
         self._timeout_ns = ns(request_timeout_s)
         self._prompt = prompt
-        self._units = units or JointUnits("radians", contract, {}, {})
+        self._units = units or PolicyVectors()
         self._position = position or (lambda: np.zeros(len(contract.action_joints)))
         self.step_ns = step_ns = round(1e9 / (spec.rate_hz or contract.rate_hz))
         """Time from an action of a chunk to the next [ns]."""

@@ -6,20 +6,20 @@ import logging
 from collections.abc import Iterable
 from contextlib import closing
 
-from ibrobot_core.calibration import load_calibration
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.contract.check import check_policy
-from ibrobot_core.contract.joint_units import JointUnits, calibrations, policy_units, with_closed_ends
 from ibrobot_core.contract.specs import Contract
+from ibrobot_core.contract.vectors import PolicyVectors
 from ibrobot_core.dispatch.dispatcher import check_strategy
 from ibrobot_core.errors import ConfigError, ContractError, IbrobotError, Problem
 from ibrobot_core.inference.build import build_policy
 from ibrobot_core.interfaces import PolicySpec
 from ibrobot_core.interfaces.run import Plugins
+from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.schema import ModelConfig
 
 
-def check_model(config: RobotConfig, model: ModelConfig, spec: PolicySpec, log: logging.Logger) -> JointUnits:
+def check_model(config: RobotConfig, model: ModelConfig, spec: PolicySpec, log: logging.Logger) -> PolicyVectors:
     """Compare a policy with the contract, and with the modes that use it.
 
     Args:
@@ -36,7 +36,7 @@ def check_model(config: RobotConfig, model: ModelConfig, spec: PolicySpec, log: 
         CalibrationError: if the unit needs a calibration that is missing.
     """
     contract = Contract.from_config(config, model.extra_observations)
-    units = _units(config, model, contract)
+    units = _vectors(config, model, contract)
     try:
         check_policy(contract, spec, model.norm_mode)
         units.check(spec)
@@ -95,10 +95,9 @@ def _line(name: str, spec: PolicySpec) -> str:
     )
 
 
-def _units(config: RobotConfig, model: ModelConfig, contract: Contract) -> JointUnits:
-    name = model.calibration
-    each = {} if model.norm_mode == "radians" else calibrations(config) if name is None else {
-        "model": with_closed_ends(load_calibration(name).numbers(), config)
-    }  # fmt: skip
-    joined = {joint: numbers for joints in each.values() for joint, numbers in joints.items()}
-    return policy_units(contract)(model.norm_mode, contract, joined, config.document)
+def _vectors(config: RobotConfig, model: ModelConfig, contract: Contract) -> PolicyVectors:
+    if model.norm_mode == "radians" and not any(part.features for part in contract.action_parts):
+        return PolicyVectors()
+    registry, kind = installed_plugins(), "units"
+    made: PolicyVectors = registry.create(kind, registry.default(kind), config, model, contract)
+    return made

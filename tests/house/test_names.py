@@ -11,7 +11,7 @@ import pytest
 from ibrobot_core.plugins import EXTRAS, KINDS, OFFICIAL, example_type, official_plugins
 
 CORE = OFFICIAL.parent
-ORDINARY = {"gripper", "imu", "joint", "keyboard", "panel", "process", "processes", "trajectory", "twist"}
+ORDINARY = {"calibrated", "gripper", "imu", "joint", "keyboard", "panel", "process", "processes", "trajectory", "twist"}
 ORDINARY |= {"drawer", "empty", "handover", "push", "sort", "stack"}
 """Types that are words of the language too: they count where a YAML would name them, as in `type: WORD`."""
 TYPED = {*KINDS, "planner", "pool", "scene"} - {"section", "source"}
@@ -60,7 +60,7 @@ def test_a_plugin_named_in_core_is_found(line: str) -> None:
 
 def test_examples_in_messages_are_default_types() -> None:
     kinds = [kind for offers in official_plugins().values() for kind in offers.get("default", ())]
-    assert sorted(kinds) == ["dataset", "hardware", "pool", "recorder", "terminal", "transport", "viewer"]
+    assert sorted(kinds) == ["dataset", "hardware", "pool", "recorder", "terminal", "transport", "units", "viewer"]
     for kind in kinds:
         assert any(example_type(kind) in offers.get(kind, ()) for offers in official_plugins().values())
 

@@ -13,6 +13,8 @@ import attrs
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from ibrobot_calibration import Calibration, JointCalibration
+from ibrobot_calibration.joint_units import calibrations
 from ibrobot_data.episode import DATASET, Job, convert_episode
 from ibrobot_data.request import ConversionRequest
 from ibrobot_feetech import bus
@@ -21,9 +23,7 @@ from ibrobot_feetech.emulator import Emulator
 from ibrobot_lerobot.options import LeRobotOptions
 from noting import Noting
 
-from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.config import load_config
-from ibrobot_core.contract.joint_units import calibrations
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.control import host
 from ibrobot_core.errors import IbrobotError

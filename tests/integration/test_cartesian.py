@@ -12,13 +12,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from command_line import run_here
+from ibrobot_calibration.joint_units import policy_units
 from ibrobot_data.ticks import Ticks, frames
 from ibrobot_kinematics import robot_model
 from ibrobot_kinematics.rotations import log
 
 from ibrobot_core.config import find_config, load_config
 from ibrobot_core.contract.frames import FrameAssembler
-from ibrobot_core.contract.joint_units import policy_units
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ComponentFailed, ConfigError
 from ibrobot_core.interfaces.run import LaunchRequest

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import run_here
+from ibrobot_calibration import JointCalibration
+from ibrobot_calibration.joint_units import calibrations, radians_to_lerobot
 from ibrobot_data.config_metadata import load_contract
 from ibrobot_feetech.ticks import ticks_to_radians
 from lerobot_units import normalised
 
-from ibrobot_core.app import calibrations, load_config
-from ibrobot_core.calibration import JointCalibration
-from ibrobot_core.contract.joint_units import radians_to_lerobot
+from ibrobot_core.app import load_config
 
 FILES = Path(__file__).parents[2] / "plugins" / "ibrobot-plugin-import" / "tests" / "files"
 ROBOTS = sorted(path.name for path in FILES.iterdir() if "base" not in path.name and "contract" not in path.name)

@@ -14,11 +14,10 @@ from pathlib import Path
 
 import attrs
 import pytest
+from ibrobot_calibration import Calibration, JointCalibration
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
 from noting import Noting
-
-from ibrobot_core.calibration import Calibration, JointCalibration
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("prompt_threads")]
 

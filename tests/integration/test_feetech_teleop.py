@@ -13,6 +13,8 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
+from ibrobot_calibration import Calibration, JointCalibration
+from ibrobot_calibration.joint_units import calibrations
 from ibrobot_data.cues import Cues
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.operator import Operator
@@ -21,9 +23,7 @@ from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
 from noting import Noting
 
-from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.config import load_config
-from ibrobot_core.contract.joint_units import calibrations
 from ibrobot_core.control import host
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.interfaces.run import LaunchRequest

@@ -14,11 +14,11 @@ import attrs
 import independent
 import pytest
 import yaml
+from ibrobot_calibration import Calibration, JointCalibration
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
 from ibrobot_mcap.reader import Rosbag2Reader
 
-from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.contract.specs import Contract
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("prompt_threads", "first_conversion")]

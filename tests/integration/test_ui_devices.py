@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ibrobot_calibration import load_calibration
 from ui_server import UiServer, run_ui
-
-from ibrobot_core.api import load_calibration
 
 pytestmark = pytest.mark.integration
 MIDDLES = {1: 2500, 2: 300, 3: 2048, 4: 3900, 5: 1000, 6: 100}

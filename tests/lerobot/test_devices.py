@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ibrobot_calibration import Calibration, JointCalibration
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
 from ibrobot_feetech.follower import FeetechFollower
@@ -22,16 +23,7 @@ from ibrobot_testing.contexts import control_context, make_robot
 from lerobot_version import LEROBOT
 from packaging.version import Version
 
-from ibrobot_core.api import (
-    Calibration,
-    HardwareError,
-    Joint,
-    JointCalibration,
-    RealClock,
-    Robot,
-    SteppedClock,
-    Torque,
-)
+from ibrobot_core.api import HardwareError, Joint, RealClock, Robot, SteppedClock, Torque
 
 pytestmark = [pytest.mark.lerobot, pytest.mark.usefixtures("patient_buses")]
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import scservo_sdk as scs
+from ibrobot_calibration import Calibration, JointCalibration, load_calibration
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import EmulatedServo, Emulator
@@ -19,7 +20,6 @@ from lerobot_units import normalised
 from lerobot_version import LEROBOT
 from packaging.version import Version
 
-from ibrobot_core.calibration import Calibration, JointCalibration, load_calibration
 from ibrobot_core.clock import SteppedClock
 
 pytestmark = [pytest.mark.lerobot, pytest.mark.usefixtures("patient_buses")]

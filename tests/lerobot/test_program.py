@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from ibrobot_calibration import Calibration, JointCalibration
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
 from ibrobot_testing.site import made_up_site
@@ -22,7 +23,6 @@ from lerobot.robots.so_follower import SO101Follower, SO101FollowerConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_robot_ibrobot import IbrobotRobot, IbrobotRobotConfig
 
-from ibrobot_core.api import Calibration, JointCalibration
 from ibrobot_core.app import ComponentFailed
 
 sys.path.insert(0, str(Path(__file__).parent))

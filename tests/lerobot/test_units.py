@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from ibrobot_calibration import Calibration, JointCalibration, load_calibration
+from ibrobot_calibration.joint_units import LEROBOT_MODES, lerobot_to_radians, radians_to_lerobot
 from ibrobot_feetech.calibration import save_calibration
 from lerobot.motors import Motor, MotorCalibration, MotorNormMode
 from lerobot.motors.feetech import FeetechMotorsBus
 from lerobot_units import angle, normalised
-
-from ibrobot_core.calibration import Calibration, JointCalibration, load_calibration
-from ibrobot_core.contract.joint_units import LEROBOT_MODES, lerobot_to_radians, radians_to_lerobot
 
 pytestmark = pytest.mark.lerobot
 

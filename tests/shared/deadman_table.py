@@ -20,6 +20,7 @@ from typing import override
 import attrs
 import numpy as np
 import pytest
+from ibrobot_calibration import Calibration, JointCalibration
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_terminal.key_reader import decode as keys_of
 from ibrobot_web import commands as page_commands
@@ -31,7 +32,6 @@ from plugin_tests import of_tests
 from takeovers import CONFIG, JOINTS
 
 from ibrobot_core.api import Context, Header, Twist, TwistStamped, Vector3
-from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.config import load_config
 from ibrobot_core.control.commands import EmergencyStop, RaiseFault
 from ibrobot_core.errors import IbrobotError

@@ -32,12 +32,12 @@ from typing import Any, override
 
 import attrs
 import numpy as np
+from ibrobot_calibration import Calibration, JointCalibration
 from ibrobot_feetech import bus
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
 from numpy.typing import NDArray
 
-from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.config import RobotConfig, from_document
 from ibrobot_core.control.build import build_core

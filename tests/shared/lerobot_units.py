@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ibrobot_core.calibration import JointCalibration
+from ibrobot_calibration import JointCalibration
 
 
 def normalised(ticks: float, mode: str, joint: JointCalibration) -> float:

@@ -26,6 +26,7 @@ from typing import Any, override
 import attrs
 import numpy as np
 import pytest
+from ibrobot_calibration import Calibration, JointCalibration
 from ibrobot_data.commanders import Commanders
 from ibrobot_data.episode import DATASET, Job, convert_episode
 from ibrobot_data.options import HANDOVER, OPERATOR, POLICY
@@ -39,7 +40,6 @@ from ibrobot_webxr.shared import close_page, open_page
 from plugin_tests import ROOT, of_tests
 
 from ibrobot_core.api import Context
-from ibrobot_core.calibration import Calibration, JointCalibration
 from ibrobot_core.config import load_config
 from ibrobot_core.contract.frames import FrameAssembler, FrameSampler
 from ibrobot_core.contract.specs import Contract

@@ -10,8 +10,8 @@ import attrs
 import numpy as np
 
 from ibrobot_core.component import Component, SourceWorker, TransportLink
-from ibrobot_core.contract.joint_units import ACTION, JointUnits
 from ibrobot_core.contract.specs import Contract
+from ibrobot_core.contract.vectors import ACTION, PolicyVectors
 from ibrobot_core.dispatch.dispatcher import Dispatcher
 from ibrobot_core.errors import wrong_input
 from ibrobot_core.inference.client import Chunk, EngineClient, InferenceClient, LockstepClient
@@ -54,7 +54,7 @@ class LoadedModel(Component):
         self._inference = inference
         self._model = model
         self.contract = Contract.from_config(session.config, model.extra_observations)
-        self.units: JointUnits
+        self.units: PolicyVectors
         """The conversion of the policy's vectors, once started."""
         self._policy: Policy | None = None
         self._engine: Engine | None = None

@@ -7,9 +7,10 @@ from typing import Any, override
 
 import attrs
 import numpy as np
+from ibrobot_calibration.joint_units import JointUnits
 from numpy.typing import NDArray
 
-from ibrobot_core.api import ActionPart, Contract, ContractError, Frame, JointState, JointUnits, PolicySpec, Vector
+from ibrobot_core.api import ActionPart, Contract, ContractError, Frame, JointState, PolicySpec, Vector
 from ibrobot_kinematics.delta_features import Deltas, Positions
 from ibrobot_kinematics.feature import ActionFeature
 from ibrobot_kinematics.tool_features import PREFIX, Piece, action_features

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ibrobot_calibration.joint_units import policy_units
 from ibrobot_kinematics import Target, read_mjcf
 from ibrobot_kinematics.feature_vectors import FeatureVectors
 from ibrobot_kinematics.follow import follow
@@ -20,7 +21,6 @@ from ibrobot_kinematics.rotations import exp
 from ibrobot_kinematics.tool_features import from_rotation_6d, rotation_6d, tool_model
 
 from ibrobot_core.api import Contract, ContractError, Description, Joint, PolicySpec, Robot, Vector
-from ibrobot_core.app import policy_units
 
 from .arms import FIVE, SIX, bent, load, write_arm
 

@@ -8,8 +8,9 @@ from typing import Self
 
 import attrs
 import numpy as np
+from ibrobot_calibration import JointCalibration, load_calibration
 
-from ibrobot_core.api import Contract, JointCalibration, Vector, load_calibration
+from ibrobot_core.api import Contract, Vector
 from ibrobot_core.app import ComponentFailed, RobotConfig
 
 _IMAGES = "observation.images."
@@ -104,7 +105,7 @@ class RobotFeatures:
 def _scale(
     calibration: JointCalibration | None, limits: tuple[float, float], closed_at: float | None, *, use_degrees: bool
 ) -> tuple[float, float]:
-    """Factor and offset of a joint, as `ibrobot_core.contract.joint_units` converts datasets."""
+    """Factor and offset of a joint, as `ibrobot_calibration.joint_units` converts datasets."""
     lower, upper = limits if calibration is None else calibration.ends(closed_at)
     if closed_at is not None:
         return (upper - lower) / 100, lower

@@ -230,7 +230,8 @@ def _options(kind: str, type_: str, overrides: Sequence[str]) -> Any:
 
 def _stated(options: ConvertOptions) -> tuple[RobotConfig | None, Mapping[str, Mapping[str, Any]] | None]:
     """The robot YAML and the calibration that the options name."""
-    from ibrobot_core.api import load_calibration
+    from ibrobot_calibration import load_calibration
+
     from ibrobot_core.app import find_config
     from ibrobot_data.config_metadata import load_contract, with_anchored
 

@@ -7,17 +7,11 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ibrobot_calibration.joint_units import with_closed_ends
 from ibrobot_provenance.robot_metadata import robot_metadata
 
 from ibrobot_core.api import CalibrationError, Contract, Robot
-from ibrobot_core.app import (
-    ExecutorConfig,
-    RobotConfig,
-    contract_alone,
-    load_config,
-    read_document,
-    with_closed_ends,
-)
+from ibrobot_core.app import ExecutorConfig, RobotConfig, contract_alone, load_config, read_document
 
 
 def load_contract(path: str | Path) -> RobotConfig:

@@ -16,12 +16,13 @@ from uuid import uuid4
 
 import attrs
 import numpy as np
+from ibrobot_calibration import Calibration, JointCalibration
+from ibrobot_calibration.joint_units import policy_units
 from ibrobot_provenance.datasets import DatasetWriter
 from ibrobot_provenance.ownership import Ownership
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
-    Calibration,
     Context,
     Contract,
     ContractError,
@@ -31,13 +32,12 @@ from ibrobot_core.api import (
     EpisodeSummary,
     Feature,
     IbrobotError,
-    JointCalibration,
     RealClock,
     RecorderError,
     Robot,
     sync,
 )
-from ibrobot_core.app import TASK_KEY, DiskFull, installed_plugins, policy_units
+from ibrobot_core.app import TASK_KEY, DiskFull, installed_plugins
 from ibrobot_data.commanders import Commanders, stretches
 from ibrobot_data.identity import identity
 from ibrobot_data.options import OPERATOR, POLICY

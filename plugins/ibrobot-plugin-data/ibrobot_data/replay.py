@@ -10,8 +10,9 @@ from pathlib import Path
 
 import attrs
 import numpy as np
+from ibrobot_calibration import load_calibration
 
-from ibrobot_core.api import Contract, ContractError, EpisodeSummary, RecorderError, Robot, load_calibration, ns, option
+from ibrobot_core.api import Contract, ContractError, EpisodeSummary, RecorderError, Robot, ns, option
 from ibrobot_core.app import (
     NORM_MODES,
     LaunchRequest,

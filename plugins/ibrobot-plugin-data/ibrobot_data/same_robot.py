@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import attrs
+from ibrobot_calibration.joint_units import calibrations
 
-from ibrobot_core.app import RobotConfig, calibrations
+from ibrobot_core.app import RobotConfig
 from ibrobot_data.episode import Unit
 
 

@@ -13,6 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import attrs
 import numpy as np
+from ibrobot_calibration.joint_units import policy_units
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
@@ -27,14 +28,7 @@ from ibrobot_core.api import (
     Tensors,
     Transport,
 )
-from ibrobot_core.app import (
-    FrameAssembler,
-    RobotConfig,
-    build_policy,
-    from_document,
-    installed_plugins,
-    policy_units,
-)
+from ibrobot_core.app import FrameAssembler, RobotConfig, build_policy, from_document, installed_plugins
 from ibrobot_diagnose.cause import Shown
 from ibrobot_diagnose.pictures import reddened
 from ibrobot_diagnose.window import Asked, Floats, Window

@@ -7,9 +7,10 @@ from functools import cached_property
 
 import attrs
 import numpy as np
+from ibrobot_calibration import Calibration, JointCalibration
 from numpy.typing import NDArray
 
-from ibrobot_core.api import Calibration, HardwareError, JointCalibration, Vector
+from ibrobot_core.api import HardwareError, Vector
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.calibration import ZERO_AT
 from ibrobot_feetech.errors import FeetechError, NoReply, TorqueStaysOn

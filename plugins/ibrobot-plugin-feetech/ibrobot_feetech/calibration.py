@@ -9,7 +9,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ibrobot_core.api import Calibration, CalibrationError, calibration_path, companion_path
+from ibrobot_calibration import Calibration, calibration_path, companion_path
+
+from ibrobot_core.api import CalibrationError
 
 ZERO_AT: Mapping[str, str] = {
     "pose": "the pose that was set by hand at calibration (tick 2048)",

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import override
 
 import numpy as np
+from ibrobot_calibration import calibration_path, load_calibration
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
@@ -23,8 +24,6 @@ from ibrobot_core.api import (
     Signal,
     Torque,
     Vector,
-    calibration_path,
-    load_calibration,
     nan_vector,
     ns,
     seconds,

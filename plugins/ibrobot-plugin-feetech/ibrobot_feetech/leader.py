@@ -8,6 +8,7 @@ from typing import override
 
 import attrs
 import numpy as np
+from ibrobot_calibration import load_calibration
 from ibrobot_terminal import HeldKeys
 from numpy.typing import NDArray
 
@@ -20,7 +21,6 @@ from ibrobot_core.api import (
     TeleopCommand,
     TeleopError,
     Vector,
-    load_calibration,
     ns,
     seconds,
 )

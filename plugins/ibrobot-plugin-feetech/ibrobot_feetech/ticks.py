@@ -6,9 +6,8 @@ import math
 from typing import Any
 
 import numpy as np
+from ibrobot_calibration import JointCalibration
 from numpy.typing import NDArray
-
-from ibrobot_core.api import JointCalibration
 
 TICKS_PER_TURN = JointCalibration.TICKS_PER_TURN
 """Encoder positions per turn."""

@@ -6,9 +6,10 @@ import os
 from pathlib import Path
 
 import attrs
+from ibrobot_calibration import Calibration
 from serial.tools import list_ports
 
-from ibrobot_core.api import Calibration, HardwareError
+from ibrobot_core.api import HardwareError
 
 ADAPTER_VENDOR = 0x1A86
 """USB vendor id of the CH340 and CH343 on the SO-101's boards."""

@@ -6,12 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from ibrobot_calibration import Calibration, JointCalibration
 from ibrobot_feetech import bus
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
 from ibrobot_testing.contexts import ARM, GRIPPER
-
-from ibrobot_core.api import Calibration, JointCalibration
 
 from .line import lay
 

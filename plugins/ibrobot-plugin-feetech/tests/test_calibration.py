@@ -10,9 +10,10 @@ import attrs
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from ibrobot_calibration import Calibration, JointCalibration, load_calibration
 from ibrobot_feetech.calibration import ZERO_AT, save_calibration
 
-from ibrobot_core.api import Calibration, CalibrationError, JointCalibration, load_calibration
+from ibrobot_core.api import CalibrationError
 
 GOOD: dict[str, Any] = {"id": 1, "drive_mode": 0, "homing_offset": -12, "range_min": 700, "range_max": 3400}
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import attrs
 import pytest
 from click.testing import CliRunner
+from ibrobot_calibration import load_calibration
 from ibrobot_feetech.commands.joints import Joint, joints_of
 from ibrobot_feetech.commands.ranges import Range, doubtful
 from ibrobot_feetech.emulator import EmulatedServo, Emulator
@@ -18,7 +19,7 @@ from ibrobot_feetech.options import TOOL
 from ibrobot_testing import terminal as terminal_module
 from ibrobot_testing.command import command_line
 
-from ibrobot_core.api import CalibrationError, load_calibration
+from ibrobot_core.api import CalibrationError
 
 feetech = command_line("feetech")
 

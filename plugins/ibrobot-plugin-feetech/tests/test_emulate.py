@@ -8,11 +8,10 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from ibrobot_calibration import load_calibration
 from ibrobot_feetech import bus as bus_module
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_testing import ibrobot_command
-
-from ibrobot_core.api import load_calibration
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from ibrobot_calibration import Calibration, load_calibration
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import EmulatedServo, Emulator
 from ibrobot_feetech.errors import NoReply, PortError, ServoFault
@@ -25,7 +26,6 @@ from ibrobot_testing.contexts import START_NS, control_context
 from ibrobot_testing.hardware import HardwareSuite
 
 from ibrobot_core.api import (
-    Calibration,
     CalibrationError,
     Context,
     Hardware,
@@ -34,7 +34,6 @@ from ibrobot_core.api import (
     Severity,
     SteppedClock,
     Torque,
-    load_calibration,
 )
 
 from .conftest import JOINTS, arm_calibration, prepare

@@ -9,6 +9,7 @@ from pathlib import Path
 import attrs
 import pytest
 from click.testing import CliRunner
+from ibrobot_calibration import load_calibration
 from ibrobot_feetech import ibrobot_doctor
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.calibration import save_calibration
@@ -24,7 +25,7 @@ from ibrobot_testing.contexts import control_context, host_context
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
-from ibrobot_core.api import HardwareError, TeleopError, load_calibration
+from ibrobot_core.api import HardwareError, TeleopError
 
 from .conftest import arm_calibration, prepare
 from .line import Line

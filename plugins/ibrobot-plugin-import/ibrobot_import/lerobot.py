@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ibrobot_core.api import load_calibration
+from ibrobot_calibration import load_calibration
+
 from ibrobot_import import so101
 from ibrobot_import.source import Fate, From, Node, Source, Titled, plain_name
 

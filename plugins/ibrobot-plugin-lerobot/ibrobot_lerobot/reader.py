@@ -13,6 +13,7 @@ from typing import Any, override
 
 import attrs
 import numpy as np
+from ibrobot_calibration.joint_units import JointUnits
 from ibrobot_provenance.robot_metadata import robot_metadata
 from numpy.typing import NDArray
 
@@ -26,7 +27,6 @@ from ibrobot_core.api import (
     EpisodeReader,
     EpisodeSummary,
     Feature,
-    JointUnits,
     Recorded,
     RecorderError,
     TopicSummary,

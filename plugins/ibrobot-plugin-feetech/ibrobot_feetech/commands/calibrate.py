@@ -8,9 +8,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import attrs
+from ibrobot_calibration import Calibration, JointCalibration, calibration_path
 from ibrobot_terminal import Guide
 
-from ibrobot_core.api import Calibration, HardwareError, IbrobotError, JointCalibration, calibration_path, option
+from ibrobot_core.api import HardwareError, IbrobotError, option
 from ibrobot_core.app import Declined
 from ibrobot_feetech.arm import calibrated_registers, relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus

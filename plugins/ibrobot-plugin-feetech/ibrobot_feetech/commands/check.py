@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import attrs
+from ibrobot_calibration import Calibration, load_calibration
 from ibrobot_terminal import Guide
 
-from ibrobot_core.api import Calibration, load_calibration, option
+from ibrobot_core.api import option
 from ibrobot_core.app import Declined, Unsuccessful
 from ibrobot_feetech.arm import calibrated_registers, write_eprom
 from ibrobot_feetech.bus import FeetechBus

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import attrs
+from ibrobot_calibration import Calibration, JointCalibration, calibration_path, load_calibration
 
-from ibrobot_core.api import Calibration, JointCalibration, calibration_path, load_calibration, option
+from ibrobot_core.api import option
 from ibrobot_core.app import RequestError, echo, on_signals
 from ibrobot_feetech.arm import Arm, calibrated_registers
 from ibrobot_feetech.calibration import save_calibration

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import attrs
+from ibrobot_calibration import Calibration, calibration_path, load_calibration
 
-from ibrobot_core.api import Calibration, CalibrationError, HardwareError, calibration_path, load_calibration, option
+from ibrobot_core.api import CalibrationError, HardwareError, option
 from ibrobot_core.app import Declined, echo
 from ibrobot_feetech.calibration import ZERO_AT, save_calibration
 from ibrobot_feetech.commands.calibrate import backup

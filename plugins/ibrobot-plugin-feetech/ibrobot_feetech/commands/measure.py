@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import attrs
+from ibrobot_calibration import JointCalibration
 from ibrobot_terminal import Guide
 
-from ibrobot_core.api import CalibrationError, JointCalibration
+from ibrobot_core.api import CalibrationError
 from ibrobot_core.app import Declined
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.joints import Joint

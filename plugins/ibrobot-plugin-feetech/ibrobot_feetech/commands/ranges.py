@@ -7,8 +7,9 @@ position that it would report with any other offset can be computed.
 from __future__ import annotations
 
 import attrs
+from ibrobot_calibration import JointCalibration
 
-from ibrobot_core.api import CalibrationError, JointCalibration
+from ibrobot_core.api import CalibrationError
 from ibrobot_feetech.commands.joints import Joint
 from ibrobot_feetech.ticks import MIDDLE_TICK, TICKS_PER_RADIAN, TICKS_PER_TURN
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from ibrobot_core.api import Calibration
+from ibrobot_calibration import Calibration
+
 from ibrobot_feetech.calibration import ZERO_AT
 from ibrobot_feetech.ticks import MIDDLE_TICK, TICKS_PER_TURN
 

@@ -10,19 +10,13 @@ from typing import Any
 
 import attrs
 import pytest
+from calibration_files import write_calibration
 from hypothesis import given
 from hypothesis import strategies as st
-from ibrobot_testing.calibration import write_calibration
+from ibrobot_calibration import ZERO_AT, Calibration, JointCalibration, calibration_path, load_calibration
 from lerobot_units import angle, normalised
 
-from ibrobot_core.calibration import (
-    ZERO_AT,
-    Calibration,
-    JointCalibration,
-    calibration_path,
-    load_calibration,
-)
-from ibrobot_core.errors import CalibrationError
+from ibrobot_core.api import CalibrationError
 
 GOOD: dict[str, Any] = {"id": 1, "drive_mode": 0, "homing_offset": -12, "range_min": 700, "range_max": 3400}
 

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, override
 
 import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.calibration import JointCalibration, load_calibration
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.errors import CalibrationError
-from ibrobot_core.interfaces import Frame, PolicySpec
-from ibrobot_core.messages import JointState
-from ibrobot_core.plugins import installed_plugins
-from ibrobot_core.robot import Vector
-from ibrobot_core.schema import RobotConfig
+from ibrobot_calibration.calibration import JointCalibration, load_calibration
+from ibrobot_core.api import CalibrationError, Contract, Frame, JointState
+from ibrobot_core.app import PolicyVectors, RobotConfig, installed_plugins
 
 ACTION = "action"
 """Key of the action vector."""
@@ -85,7 +80,7 @@ class _Elements:
     """Arguments of `radians_to_lerobot`, one number per element."""
 
 
-class JointUnits:
+class JointUnits(PolicyVectors):
     """Converts the joint positions of observations and actions; leaves velocities, efforts and all else unchanged.
 
     `degrees` and `range_m100_100` are LeRobot's units for the joints of an arm. As in LeRobot, a joint that the
@@ -103,9 +98,6 @@ class JointUnits:
         CalibrationError: if the calibration of a joint is needed and missing, or nothing states the anchored joints.
         ValueError: for an unknown unit.
     """
-
-    needs: tuple[str, ...] = ()
-    """Keys of observations that `commands` needs, whatever the policy reads."""
 
     def __init__(
         self,
@@ -128,31 +120,18 @@ class JointUnits:
                 modes.setdefault(_CLOSED_MODE if joint in closed else norm_mode, {})[index] = joint
             self._elements[key] = [_elements(mode, named, calibration, closed) for mode, named in modes.items()]
 
+    @override
     def __call__(self, values: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """Convert values of a tick from radians to the unit; joints on the last axis. Copies arrays that change."""
         return {key: self._converted(key, value, radians_to_lerobot) for key, value in values.items()}
 
+    @override
     def frame(self, frame: Frame) -> Frame:
-        """Convert a frame with its history and prefix to the unit."""
         prefix = None if frame.prefix is None else self._converted(ACTION, frame.prefix, radians_to_lerobot)
         history = tuple(self.frame(each) for each in frame.history)
         return attrs.evolve(frame, values=self(frame.values), prefix=prefix, history=history)
 
-    def commands(self, actions: Vector, seen: Mapping[str, NDArray[Any]], start: Vector) -> tuple[Vector, int]:
-        """The positions of the joints [rad], shape (N, A), that actions of a policy command, and how many it held.
-
-        Args:
-            actions: in the policy's units, shape (N, F).
-            seen: the observations for which the policy gave them, in radians.
-            start: the joints' commands before them [rad], shape (A,).
-        """
-        return self.radians(ACTION, actions), 0
-
-    def check(self, spec: PolicySpec) -> None:
-        """Raise ContractError if a policy cannot give actions of this form; any can give positions of joints."""
-
+    @override
     def radians(self, key: str, value: NDArray[Any]) -> NDArray[Any]:
-        """Convert the vectors of one key from the unit to radians; joints on the last axis."""
         return self._converted(key, value, lerobot_to_radians)
 
     def _converted(self, key: str, value: NDArray[Any], convert: Callable[..., NDArray[Any]]) -> NDArray[Any]:

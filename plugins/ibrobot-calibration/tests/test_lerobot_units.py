@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from ibrobot_calibration import ZERO_AT, JointCalibration
+from ibrobot_calibration.joint_units import LEROBOT_MODES, lerobot_to_radians, radians_to_lerobot
 from lerobot_units import angle, normalised
-
-from ibrobot_core.calibration import ZERO_AT, JointCalibration
-from ibrobot_core.contract.joint_units import LEROBOT_MODES, lerobot_to_radians, radians_to_lerobot
 
 modes = st.sampled_from(LEROBOT_MODES)
 joints = st.builds(

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 import attrs
 
-from ibrobot_core.errors import CalibrationError
+from ibrobot_core.api import CalibrationError
 
 VERSION = 2
 """Version of the companion file."""

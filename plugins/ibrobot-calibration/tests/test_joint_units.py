@@ -10,19 +10,15 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
+from calibration_files import write_calibration
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from ibrobot_testing.calibration import write_calibration
+from ibrobot_calibration import Calibration, JointCalibration
+from ibrobot_calibration.joint_units import JointUnits, calibrations, with_closed_ends
 
-from ibrobot_core.calibration import Calibration, JointCalibration
-from ibrobot_core.config import load_config
-from ibrobot_core.contract.joint_units import JointUnits, calibrations, with_closed_ends
-from ibrobot_core.contract.specs import Contract
-from ibrobot_core.descriptors import HardwareDescriptor
-from ibrobot_core.errors import CalibrationError
-from ibrobot_core.options import option
+from ibrobot_core.api import CalibrationError, Contract, HardwareDescriptor, option
+from ibrobot_core.app import RobotConfig, load_config
 from ibrobot_core.plugins import Entry, discover
-from ibrobot_core.schema import RobotConfig
 
 ROBOT = """
 robot:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from ibrobot_testing.calibration import write_calibration
+from calibration_files import write_calibration
+from ibrobot_calibration import Calibration, JointCalibration
+from ibrobot_calibration.joint_units import radians_to_lerobot
 
-from ibrobot_core.calibration import Calibration, JointCalibration
-from ibrobot_core.contract.joint_units import radians_to_lerobot
-from ibrobot_core.errors import ComponentFailed
-from ibrobot_core.interfaces import Frame
+from ibrobot_core.api import Frame
+from ibrobot_core.app import ComponentFailed
 
 if TYPE_CHECKING:
     from fake_runs import Runs

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from ibrobot_core.api import Calibration, companion_path
+from ibrobot_calibration import Calibration, companion_path
 
 
 def write_calibration(calibration: Calibration, path: Path) -> Path:

@@ -10,16 +10,24 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from ibrobot_calibration import ZERO_AT, Calibration, JointCalibration
+from ibrobot_calibration.joint_units import JointUnits, radians_to_lerobot
 from ibrobot_testing.contexts import host_context
 from lerobot_units import angle, normalised
 from numpy.typing import NDArray
 
-from ibrobot_core.calibration import ZERO_AT, Calibration, JointCalibration
-from ibrobot_core.contract.joint_units import JointUnits, radians_to_lerobot
-from ibrobot_core.contract.specs import ActionPart, Contract, ObservationPart
-from ibrobot_core.errors import CalibrationError
-from ibrobot_core.interfaces import Feature, Frame, Policy, PolicySpec, Tensors
-from ibrobot_core.schema import Align
+from ibrobot_core.api import (
+    ActionPart,
+    CalibrationError,
+    Contract,
+    Feature,
+    Frame,
+    ObservationPart,
+    Policy,
+    PolicySpec,
+    Tensors,
+)
+from ibrobot_core.app import Align
 
 JOINTS = host_context().robot.joint_names
 CALIBRATION: dict[str, dict[str, Any]] = {
