@@ -26,12 +26,12 @@ def run(*, simulated: bool = False) -> Any:
 
 
 def test_each_servo_has_a_row() -> None:
-    assert PANEL.rows(run()) == [
+    assert PANEL.make(run()) == [
         ("elbow", "31 °C", "7.4 V", "0.12 A", "25%"),
         ("gripper", "-", "7.5 V", "0.00 A", "-50%"),
     ]
-    assert all(len(row) == len(PANEL.columns) for row in PANEL.rows(run()))
+    assert all(len(row) == len(PANEL.columns) for row in PANEL.make(run()))
 
 
 def test_a_simulation_has_no_servos() -> None:
-    assert list(PANEL.rows(run(simulated=True))) == []
+    assert list(PANEL.make(run(simulated=True))) == []
