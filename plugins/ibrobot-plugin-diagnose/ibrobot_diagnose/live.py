@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import override
 
 import attrs
+from ibrobot_calibration.joint_units import calibrations
 
 import ibrobot_core
 from ibrobot_core.api import (
@@ -34,7 +35,6 @@ from ibrobot_core.app import (
     RunView,
     Session,
     SourceWorker,
-    calibrations,
     installed_plugins,
 )
 from ibrobot_diagnose.cause import DEVICE_POSE
