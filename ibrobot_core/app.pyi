@@ -112,6 +112,7 @@ from ibrobot_core.launch.runtime import (
     ESTOP as ESTOP,
     CHECK_ESTOP as CHECK_ESTOP,
 )
+from ibrobot_core.launch.authority import AGENT_LOG as AGENT_LOG, Agent as Agent, Authority as Authority, Grant as Grant
 from ibrobot_core.interfaces.transport import HANDLER_THREADS as HANDLER_THREADS
 from ibrobot_core.interfaces.policy import (
     check_finite as check_finite,

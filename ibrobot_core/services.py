@@ -69,6 +69,8 @@ class Service[Q, A]:
     """The ROS 2 type with the same fields, if there is one, e.g. `ibrobot_msgs/srv/MoveToPose`, or an action."""
     progress: Service[NoRequest, Any] | None = None
     """For a service that takes its time: answers with what it has done so far, which is an action's feedback."""
+    result: Service[Any, Any] | None = None
+    """For a service that answers with a number at once: answers for this number with the result, or null until then."""
     cancel: Service[NoRequest, Any] | None = None
     """For a service that takes its time: ends it early; it then answers its caller."""
 

@@ -11,7 +11,7 @@ import logging
 import queue
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import attrs
 
@@ -25,9 +25,6 @@ from ibrobot_core.interfaces.teleop import OperatorEvent
 from ibrobot_core.pulses import Pulse
 from ibrobot_core.robot import Vector
 from ibrobot_core.schema import ControlMode, RobotConfig
-
-if TYPE_CHECKING:
-    from ibrobot_core.launch.authority import Authority
 
 
 class CommandSource:
@@ -144,7 +141,8 @@ class RunView(Protocol):
     @property
     def stops(self) -> int: ...
 
-    authority: Authority
+    @property
+    def authority(self) -> Any: ...
 
     @property
     def stopped_by(self) -> str: ...

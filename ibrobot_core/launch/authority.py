@@ -14,7 +14,7 @@ from contextlib import suppress
 from contextvars import ContextVar
 from functools import partial
 from types import NoneType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import attrs
 import numpy as np
@@ -27,9 +27,6 @@ from ibrobot_core.robot import Vector
 from ibrobot_core.selection import Selection
 from ibrobot_core.services import NoRequest, Plain, Service
 from ibrobot_core.units import ns, seconds
-
-if TYPE_CHECKING:
-    from ibrobot_core.launch.session import Session
 
 AGENT_LOG = "/agent/log"
 """std_msgs/msg/String: JSON with what agents ask for, who grants it, and how it ends."""
@@ -111,10 +108,10 @@ class Authority:
     """What agents may do in a run, and what they did. Doors for agents share that of the session.
 
     Args:
-        session: the run.
+        session: the run, a `launch.session.Session`.
     """
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Any) -> None:
         self._session = session
         self._agents: list[Agent] = []
         self._scope: Scope | None = None

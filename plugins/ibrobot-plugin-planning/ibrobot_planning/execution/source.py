@@ -36,9 +36,6 @@ from ibrobot_planning.goals.tool import pose_matrix
 from ibrobot_planning.planner import AnyGoal, Goal, JointGoal, OrientationPolicy, PlanResult, PoseGoal
 from ibrobot_planning.world.objects import observed_world
 
-GO_TO = Service(
-    "/planning/go_to", GoTo, int, "Move to a goal, which replaces the present one; answers with its number.", "goal"
-)
 RESULT: Service[Numbered, MoveResult | None] = Service(
     "/planning/result",
     Numbered,
@@ -50,8 +47,22 @@ RESULT: Service[Numbered, MoveResult | None] = Service(
 CANCEL = Service(
     "/planning/cancel", NoRequest, NoneType, "Drop all goals: the robot slows down and holds.", urgent=True
 )
+GO_TO = Service(
+    "/planning/go_to",
+    GoTo,
+    int,
+    "Move to a goal, which replaces the present one; answers with its number.",
+    "goal",
+    result=RESULT,
+    cancel=CANCEL,
+)
 MOVE_ACTION = Service(
-    "/move_action", MoveRequest, int, "Move to the first goal that can be reached; answers with its number."
+    "/move_action",
+    MoveRequest,
+    int,
+    "Move to the first goal that can be reached; answers with its number.",
+    result=RESULT,
+    cancel=CANCEL,
 )
 """Named like MoveIt's action, as is the next one."""
 EXECUTE = Service(
@@ -60,6 +71,8 @@ EXECUTE = Service(
     int,
     "Follow a trajectory that begins where the robot is; answers with its number.",
     limits=RequestLimits(values=60_000),
+    result=RESULT,
+    cancel=CANCEL,
 )
 MOVE_TO_POSE = Service(
     "/moveit_gateway/move_to_pose",

@@ -43,7 +43,14 @@ CANCEL = Service(
     "/task/cancel", NoRequest, NoneType, "End the present task: the robot slows down and holds.", urgent=True
 )
 RUN = Service(
-    "/task/run", RunTask, int, "Check a task and begin it; answers with its number.", "task", _LIMITS, cancel=CANCEL
+    "/task/run",
+    RunTask,
+    int,
+    "Check a task and begin it; answers with its number.",
+    "task",
+    _LIMITS,
+    result=RESULT,
+    cancel=CANCEL,
 )
 STATUS = "/task/status"
 """std_msgs/msg/String, latched: JSON with `task`, `step`, `steps`, `kind`, `name` and `state`."""
