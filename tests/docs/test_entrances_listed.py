@@ -28,6 +28,8 @@ STILL_SERVICES = {
     "/record_episode/cancel", "/record_episode/discard", "/record_episode/get_info", "/record_episode/highlight",
     "/record_episode", "/record_episode/progress", "/record_episode/redo", "/record_episode/start",
     "/record_episode/status", "/record_episode/stop",
+    # Tools of agents, which show the robot.
+    "look", "state", "wait",
     # An operator's answer to a question of a command, from standard input.
     "answer",
     # Answers with what is planned or known.
@@ -40,6 +42,7 @@ STILL_SERVICES = {
 }  # fmt: skip
 """Services that move nothing."""
 OTHER_SERVICES = {
+    "ibrobot_mcp/tools.py: name": "/task/step",
     "ibrobot_kinematics/twist.py: topic": "teleop twist",
     "ibrobot_web/messages.py: name": "",  # commands of pages, see `page_commands`
     "ibrobot_web/ui/context.py: ''": "",  # requests of the page that starts runs
@@ -58,6 +61,7 @@ SUBSCRIBERS = {
             "ibrobot_planning/tasks/performing.py", "ibrobot_ros/topics.py", "ibrobot_ros2/inference.py",
             "ibrobot_diagnose/live.py", "ibrobot_kinematics/tool_pose.py", "ibrobot_web/objects.py",
             "ibrobot_web/viewer.py",
+            "ibrobot_mcp/audit.py", "ibrobot_mcp/pictures.py",
             "ibrobot_webxr/images.py", "ibrobot_webxr/server.py", "ibrobot_zenoh/shared_topics.py",
             # The world.
             "ibrobot_planning/world/clouds.py", "ibrobot_planning/world/frames.py",
@@ -106,6 +110,7 @@ COMMANDS = {
     "eval": "engine monolithic",
     "replay": "ibrobot replay",
     "task": "/task/run",
+    "mcp": "ibrobot mcp",
     "action": "FollowJointTrajectory",
     "service": "/planning/go_to",
     "topic": "/cmd_pose",
@@ -113,6 +118,7 @@ COMMANDS = {
     "ui": "page goal",  # it launches runs, and shows their pages
     **dict.fromkeys(
         (
+            "agent",
             "camera", "certs", "config", "config copy", "config import", "config new", "config schema", "contract",
             "convert", "damiao", "datasets", "datasets check", "datasets info", "description", "doctor", "episodes",
             "episodes delete", "episodes list", "episodes mark", "episodes repair", "episodes trash", "episodes trim",

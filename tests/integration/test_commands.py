@@ -27,6 +27,7 @@ WRONG_FILES = {
     "replay EPISODE BAD": (),
     "replay EPISODE so101_blind --sim --dry-run --calibration BAD": (),
     "launch BAD --dry-run": (),
+    "mcp BAD --dry-run": (),
     "record BAD --dry-run": (),
     "record so101_blind --sim --dry-run --root BAD": ("missing", "folder"),
     "convert BAD --out new": (),
@@ -121,6 +122,7 @@ WRONG_FILES = {
 }
 """Command line -> the kinds of files that are right there."""
 WITHOUT_FILES = {
+    "agent arm", "agent disarm", "agent status",
     "plugins check",
     "config schema", "plugins show", "doctor", "camera list", "damiao emulate", "feetech find-port",
     "gamepad list",
@@ -230,6 +232,8 @@ def test_wrong_file_is_one_error_with_exit_code_2(line: str, kind: str, folder: 
 JSON = {
     "launch so101_blind --sim --lockstep --duration 0.1 --json": 0,
     "launch so101_blind --sim --dry-run --json": 0,
+    "mcp so101_blind --sim --dry-run --json": 0,
+    "mcp BAD --json": 2,
     "launch BAD --json": 2,
     "record so101_blind --sim --lockstep --duration 0.1 --root new --json": 0,
     "record BAD --json": 2,
@@ -247,6 +251,7 @@ JSON = {
     "plugins check attrs --json": 2,
     "plugins new teleop my_stick --out new --json": 0,
     "doctor --json": None,
+    "agent status --json": 2,
     "camera list --json": 0,
     "camera calibrate BAD --json": 2,
     "explain EPISODE --json": 0,

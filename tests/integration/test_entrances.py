@@ -40,6 +40,8 @@ ADAPTERS: Mapping[str, Callable[[], Entrance]] = {
     "/execute_trajectory": entrances.Execute,
     "/cmd_pose": entrances.CmdPose,
     "/task/run": entrances.Task,
+    "/task/step": entrances.TaskStep,
+    "ibrobot mcp": entrances.Agent,
     "FollowJointTrajectory": entrances.FollowJointTrajectory,
     "GripperCommand": entrances.GripperCommand,
     "ParallelGripperCommand": entrances.ParallelGripperCommand,
@@ -71,7 +73,7 @@ ADAPTERS: Mapping[str, Callable[[], Entrance]] = {
 
 _SERVICES = (
     "source planner", "/planning/go_to", "/move_action", "/moveit_gateway/move_to_pose",
-    "/moveit_gateway/move_to_configuration", "/execute_trajectory", "/task/run", "/intervene",
+    "/moveit_gateway/move_to_configuration", "/execute_trajectory", "/task/run", "/task/step", "/intervene",
 )  # fmt: skip
 _CORRECTIONS = "plugins/ibrobot-plugin-data/tests/test_corrections.py"
 _LOST = f"{_CORRECTIONS}::test_a_lost_device_is_a_fault_and_a_reset_gives_the_policy_the_robot"

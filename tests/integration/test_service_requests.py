@@ -51,7 +51,6 @@ def run_offers(tmp_path_factory: pytest.TempPathFactory) -> Offered:
 def test_every_declared_service_is_asked(run_offers: Offered):
     """A new service belongs into the run of `plain_requests.EVERYTHING`, if it is not in it by itself."""
     only_for_ros = {"/act_inference_node/DispatchInfer"}
-    only_for_ros |= {"/agent/arm", "/agent/disarm", "/agent/status"}
     assert set(declared()) - set(run_offers.services) == only_for_ros
 
 

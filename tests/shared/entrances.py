@@ -44,6 +44,7 @@ from ibrobot_core.channel import Channel
 from ibrobot_core.config import RobotConfig, from_document, load_config
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.interfaces.run import LaunchRequest
+from ibrobot_core.launch.authority import Grant
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Session
 from ibrobot_core.plugins import installed_plugins
@@ -388,6 +389,46 @@ class Task(Entrance):
         yield lambda: self._task(f"  - move: {{xyz: [0.2, {text}, 0.1]}}\n")
         yield lambda: self._task(f"  - move: {{joints: {{shoulder_pan: {FAR}}}, speed: {text}}}\n")
         yield lambda: self._task(f"  - gripper: {{position: {text}}}\n")
+
+
+class TaskStep(Entrance):
+    """`/task/step`."""
+
+    overrides = (EMPTY, "tasks={}")
+
+    @override
+    def ask(self) -> object:
+        return self.call("/task/step", {"move": {"joints": {"shoulder_pan": FAR}}})
+
+    @override
+    def with_number(self, value: float) -> Iterator[Callable[[], object]]:
+        yield lambda: self.call("/task/step", {"move": {"joints": {"shoulder_pan": value}}})
+        yield lambda: self.call("/task/step", {"move": {"line": [{"xyz": [value, 0, 0], "relative": True}]}})
+        yield lambda: self.call("/task/step", {"move": {"joints": {"shoulder_pan": FAR}, "speed": value}})
+        yield lambda: self.call("/task/step", {"gripper": {"position": value}})
+
+
+class Agent(GoTo):
+    """An agent to which a person has granted everything that it asks for."""
+
+    overrides = (EMPTY, "mcp={http: false}")
+
+    @override
+    def meet(self) -> None:
+        self.agent = self.run.session.authority.join("agent")
+        self.again()
+
+    @override
+    def again(self) -> None:
+        self.run.session.bus.call("/agent/arm", Grant(3600.0, ("/planning/go_to",), speed=1.0, lease=120.0))
+
+    @override
+    def call(self, service: str, request: Any = None) -> Any:
+        return self.run.session.authority.call(self.agent, service, request)
+
+    @override
+    def die(self) -> None:
+        self.run.session.authority.leave(self.agent)
 
 
 class _Wire:

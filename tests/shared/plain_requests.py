@@ -42,6 +42,7 @@ POSITION = "executors: [arm_position, gripper_position]"
 EVERYTHING = (
     "world={scene: true, clouds: {camera: {topic: /camera/points, when_stale: forget}}}",
     "tasks={}",
+    "mcp={http: false}",
     "recording={type: mcap, root: episodes}",
     "episodes={keep: highlights}",
     "teleoperation={web: {type: web}, twist: {type: twist}}",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import attrs
 
 from ibrobot_core.api import OptionFault, TeleopDescriptor, documented, option
-from ibrobot_core.app import RUN_KEYS, check_key, installed_plugins
+from ibrobot_core.app import AGENT_LOG, RUN_KEYS, check_key, installed_plugins
 
 if TYPE_CHECKING:
     from ibrobot_core.app import RobotConfig, RunView
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 COMMANDER = "/commander"
 """Topic (std_msgs/msg/String) with who commands the robot at each state of control, in modes with `intervene`."""
 GUARD = "/guard"
-LABELS = (COMMANDER, GUARD)
-"""Topics beside those of the contract that say of each tick who commanded, and what the guard of control kept apart."""
+LABELS = (COMMANDER, GUARD, AGENT_LOG)
+"""Topics beside those of the contract: who commanded, what the guard of control kept apart, what agents asked for."""
 POLICY, OPERATOR, HANDOVER = "policy", "operator", "handover"
 """The words on `COMMANDER`; in a handover nobody commands, and the arm holds."""
 PLANNER = "planner"

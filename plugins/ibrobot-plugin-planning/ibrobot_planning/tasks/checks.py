@@ -49,6 +49,8 @@ class Situation:
     """Why no episode can be recorded; empty if one can."""
     elsewhere: Collection[str] = ()
     """Objects whose poses are not known yet."""
+    held: str | None = None
+    """What the gripper holds at the beginning."""
 
 
 @attrs.frozen(eq=False)
@@ -79,7 +81,7 @@ class _Checks:
         self._tool_planners = tool_planners(situation.registry)
         self._moved = set(situation.elsewhere)
         """Objects that have left the poses that the world has for them."""
-        self._held: str | None = None
+        self._held = situation.held
         self._recording: Key | None = None
         """A step that records the next policy."""
         self._records_task = False

@@ -73,16 +73,18 @@ class Performance:
         number: its number.
         stops: number of emergency stops when it was requested; it fails after a newer one.
         begins: called with this and each step before it begins.
+        held: what the gripper holds at the beginning.
 
     Attributes:
         begun_ns: when it began [ns].
         cancelled: why it ends early; empty otherwise.
+        held: what the gripper holds.
         results: results of the steps that have ended.
     """
 
     def __init__(
         self, session: RunView, checked: CheckedTask, number: int, stops: int,
-        begins: Callable[[Performance, Step], None],
+        begins: Callable[[Performance, Step], None], held: str | None = None,
     ) -> None:  # fmt: skip
         self._session = session
         self.checked, self.number = checked, number
@@ -95,8 +97,7 @@ class Performance:
         self._recording = False
         """Whether an episode of the task is being recorded."""
         self._stops = stops
-        self._held: str | None = None
-        """What the gripper holds."""
+        self.held = held
         self._context = contextvars.copy_context()
         """That of the caller, so that what an agent begins is its own to the end."""
         self._arm = self._perform()
@@ -185,7 +186,7 @@ class Performance:
         All fail if the robot stops, or if a list fails after it has grasped or released something.
         """
         failures: list[StepFailed | IbrobotError] = []
-        held = self._held
+        held = self.held
         for number, steps in enumerate(alternatives, 1):
             self._enter(self.checked.mode.name)
             try:
@@ -194,7 +195,7 @@ class Performance:
                     yield from self._act(each)
             except (StepFailed, IbrobotError) as error:
                 self._episode = None
-                if self._session.faults or self._session.stops != self._stops or self._held != held:
+                if self._session.faults or self._session.stops != self._stops or self.held != held:
                     raise
                 failures.append(error)
                 self._session.log.info("alternative %d of %d: %s", number, len(alternatives), error)
@@ -287,7 +288,7 @@ class Performance:
         target = Target(f"{joint}={step.position:g}", None, {joint: step.position})
         if step.release is not None:
             session.bus.call(DETACH, Detached(step.release))
-            self._held = None
+            self.held = None
         yield from self._go(target)
         position = float(session.measured().position[session.config.robot.joint_names.index(joint)])
         if step.grasp is not None:
@@ -298,7 +299,7 @@ class Performance:
                     f"nothing stopped the gripper on its way to {step.position:g} rad: no {step.grasp!r} there"
                 )
             session.bus.call(ATTACH, Attached(step.grasp))
-            self._held = step.grasp
+            self.held = step.grasp
         return {"position_rad": round(position, 4)}
 
     def _wait(self, step: WaitStep) -> Steps:

@@ -5,18 +5,28 @@ from __future__ import annotations
 import json
 import queue
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import NoneType
 from typing import Any, override
 
 import attrs
 
 from ibrobot_core.api import PlanningError, String, documented, option, seconds
-from ibrobot_core.app import CONTROL, NoRequest, RequestLimits, RunView, Service, SessionWorker
+from ibrobot_core.app import (
+    CONTROL,
+    NoRequest,
+    RequestLimits,
+    RunView,
+    Service,
+    SessionWorker,
+    default_of,
+    dump_yaml,
+    fields,
+)
 from ibrobot_planning.execution.requests import Numbered
 from ibrobot_planning.execution.results import Results
 from ibrobot_planning.tasks.checks import CheckedTask, Situation, check_task
-from ibrobot_planning.tasks.format import Step
+from ibrobot_planning.tasks.format import Step, TaskStep
 from ibrobot_planning.tasks.performing import Performance
 from ibrobot_planning.tasks.reading import TaskFile, read_task
 from ibrobot_planning.tasks.result import TaskResult
@@ -52,6 +62,14 @@ RUN = Service(
     result=RESULT,
     cancel=CANCEL,
 )
+STEP = Service(
+    "/task/step",
+    TaskStep,
+    int,
+    "Check one step of a task and begin it: a motion, a grasp, a policy; answers with its number.",
+    result=RESULT,
+    cancel=CANCEL,
+)
 STATUS = "/task/status"
 """std_msgs/msg/String, latched: JSON with `task`, `step`, `steps`, `kind`, `name` and `state`."""
 _POLL_S = 0.01
@@ -63,18 +81,36 @@ def _read(request: RunTask) -> TaskFile:
     return read_task(request.task, "the request", expands=False)
 
 
+def _of_step(step: TaskStep) -> TaskFile:
+    return read_task(dump_yaml({"steps": [_given(step)]}), step.name or step.kind, expands=False)
+
+
+def _given(value: Any) -> Any:
+    """A step as plain data, without what has its default."""
+    if attrs.has(type(value)):
+        known = fields(type(value)).items()
+        values = {name: (getattr(value, field.name), default_of(field)) for name, field in known}
+        return {name: _given(each) for name, (each, default) in values.items() if each != default}
+    if isinstance(value, Mapping):
+        return {name: _given(each) for name, each in value.items()}
+    return [_given(each) for each in value] if isinstance(value, tuple) else value
+
+
 class TaskRunner(SessionWorker):
-    """Performs tasks: `/task/run`, `/task/check`, `/task/result` and `/task/cancel`."""
+    """Performs tasks: `/task/run`, `/task/step`, `/task/check`, `/task/result` and `/task/cancel`."""
 
     def __init__(self, session: RunView) -> None:
         world = (SECTION,) if SECTION in session.config.plugin_sections else ()
         super().__init__(session, "tasks", f"performs tasks: {RUN.name}", (CONTROL, *world))
         self._running: Performance | None = None
+        self._held: str | None = None
+        """What the gripper held at the end of the last task."""
         self._results: Results[TaskResult] = Results("task", RUN.name)
         self._lock = threading.Lock()
         self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._services: dict[Service[Any, Any], Callable[[Any], Any]] = {
             RUN: lambda request: self.run(_read(request)),
+            STEP: lambda request: self.run(_of_step(request)),
             CHECK: lambda request: self._checked(_read(request)) and None,
             RESULT: lambda request: self.result(request.number),
             CANCEL: lambda _: self.cancel("cancelled"),
@@ -99,7 +135,8 @@ class TaskRunner(SessionWorker):
         with self._lock:
             if self._running is not None:
                 raise PlanningError(f"task {self._running.number} is running; {CANCEL.name} ends it")
-            self._running = running = Performance(self.session, checked, self._results.number(), stops, self._show)
+            number, held = self._results.number(), self._carried()
+            self._running = running = Performance(self.session, checked, number, stops, self._show, held)
         self._wake.put(None)
         return running.number
 
@@ -149,7 +186,13 @@ class TaskRunner(SessionWorker):
         world = session.bus.call(OBSERVED).world if session.bus.serves(OBSERVED) else None
         movable = [thing.name for thing in scene if thing.topic]
         start = session.state.command if session.state is not None else None
-        return check_task(file, Situation(config, session.registry, world, movable, start, why))
+        return check_task(file, Situation(config, session.registry, world, movable, start, why, held=self._carried()))
+
+    def _carried(self) -> str | None:
+        """What the last task has left in the gripper, and the world still has there."""
+        world = self.session.bus.call(OBSERVED).world if self.session.bus.serves(OBSERVED) else None
+        thing = world.objects.get(self._held) if world is not None and self._held is not None else None
+        return self._held if thing is not None and thing.link is not None else None
 
     def result(self, number: int) -> TaskResult | None:
         """The result of a task; None until it has ended.
@@ -172,7 +215,7 @@ class TaskRunner(SessionWorker):
             session.log.error("task %s %s: %s", name, outcome.lower(), message)
             session.outcome.goals_failed += 1
         with self._lock:
-            self._running = None
+            self._running, self._held = None, performance.held
             self._results.end(performance.number, result)
         self._show(performance, None, outcome.lower())
 

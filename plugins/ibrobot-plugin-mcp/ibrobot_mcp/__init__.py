@@ -1,0 +1,41 @@
+"""The plugin's hooks: the section `mcp`, and the commands `ibrobot mcp` and `ibrobot agent …`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from ibrobot_core.api import Late, OptionFault, hookimpl
+from ibrobot_core.app import Command, SectionDescriptor
+from ibrobot_mcp.options import McpOptions
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Robot
+
+
+def _check(options: McpOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+    for name, path in (("certificate", options.certificate), ("key", options.key)):
+        if path is not None and not path.is_file():
+            yield OptionFault((name,), f"{path}: no such file")
+
+
+@hookimpl
+def ibrobot_sections() -> Iterable[SectionDescriptor]:
+    """A door for agents."""
+    yield SectionDescriptor(
+        type="mcp",
+        options=McpOptions,
+        make=Late("ibrobot_mcp.door:AgentDoor"),
+        check_options=_check,
+        summary="the robot's services as tools of the Model Context Protocol, within what a person grants",
+    )
+
+
+@hookimpl
+def ibrobot_commands() -> Iterable[Command]:
+    """`ibrobot mcp` and `ibrobot agent …`."""
+    yield Command("mcp", Late("ibrobot_mcp.command:RunMcp"), "Run a robot for an agent, over standard input.")
+    yield Command("agent", summary="Let an agent move a robot that runs here, and end that.")
+    yield Command("agent arm", Late("ibrobot_mcp.commands:ArmAgent"))
+    yield Command("agent disarm", Late("ibrobot_mcp.commands:DisarmAgent"))
+    yield Command("agent status", Late("ibrobot_mcp.commands:ShowAgents"))

@@ -1,0 +1,106 @@
+"""`ibrobot agent …`: a person grants an agent authority over a robot that runs on this machine, and ends it."""
+
+from __future__ import annotations
+
+import getpass
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from ibrobot_core.api import IbrobotError, option
+from ibrobot_core.app import RequestError, confirm, echo
+from ibrobot_mcp.persons import ask, running
+
+MOVING = ("/planning/go_to", "/move_action", "/task/step", "/task/run")
+"""What `ibrobot agent arm` grants by default, of what a run serves."""
+
+
+@attrs.frozen(kw_only=True)
+class _OfRun:
+    robot: str = option("", typed="[ROBOT]", help="name of the robot; needed if several run here")
+
+    def path(self) -> Path:
+        """The socket of the run.
+
+        Raises:
+            RequestError: if there is none, or several.
+        """
+        sockets = [path for path in running() if self.robot in ("", path.stem)]
+        if not sockets:
+            raise RequestError("no robot with a door for agents runs here: start one by `ibrobot mcp`")
+        if len(sockets) > 1:
+            raise RequestError(f"several run here, name one: {', '.join(path.stem for path in sockets)}")
+        return sockets[0]
+
+
+@attrs.frozen(kw_only=True)
+class ArmAgent(_OfRun):
+    """Let an agent move the robot, for a time and within a scope.
+
+    The agent may then call the services named by `--allow`, nothing moves faster than `--speed`, and nothing leaves
+    `--region`. Esc, a stop on the page, `ibrobot agent disarm`, silence of the agent and the end of the time end it;
+    the arm then holds.
+    """
+
+    seconds: float = option(300.0, unit="s", gt=0, le=3600, help="how long")
+    speed: float = option(0.25, ge=0.01, le=1, help="fraction of the velocity limits")
+    allow: tuple[str, ...] = option((), typed="--allow SERVICE", help=f"a service; by default {', '.join(MOVING)}")
+    region: tuple[str, ...] = option(
+        (), typed="--region PATH=LOW:HIGH,…", help="e.g. tool.position=0.1:0.4,-0.2:0.2,0.0:0.4 [m]"
+    )
+    lease: float = option(10.0, unit="s", ge=0.5, le=120, help="longest silence of the agent's program")
+    agent: str = option("", typed="--agent NAME", help="the agent; needed if several are connected")
+    yes: bool = option(False, typed="--yes", help="do not ask")
+
+    def __call__(self) -> None:
+        path = self.path()
+        services = list(self.allow or MOVING)
+        grant = {
+            "seconds": self.seconds, "services": services, "speed": self.speed, "lease": self.lease,
+            "agent": self.agent, "region": dict(map(_bounds, self.region)), "by": getpass.getuser(),
+        }  # fmt: skip
+        echo(f"{path.stem}: for {self.seconds:g} s, {self.speed:.0%} of the speed limits, {', '.join(services)}")
+        echo(f"region: {', '.join(self.region) or 'no limits but those of the joints'}")
+        if not self.yes and not confirm("Let the agent move the robot?", flag="--yes"):
+            raise IbrobotError("nothing was granted")
+        echo(ask(path, "/agent/arm", grant))
+
+
+@attrs.frozen(kw_only=True)
+class DisarmAgent(_OfRun):
+    """End an agent's authority: the arm holds until you grant it again, or enter its mode."""
+
+    def __call__(self) -> None:
+        ask(self.path(), "/agent/disarm")
+
+
+@attrs.frozen(kw_only=True)
+class ShowAgents(_OfRun):
+    """Show the connected agents, and what they may do."""
+
+    def __call__(self) -> Any:
+        return ask(self.path(), "/agent/status")
+
+    def show(self, status: Mapping[str, Any]) -> None:
+        """Print it."""
+        echo(f"connected: {', '.join(status['agents']) or 'none'}")
+        if status["armed"]:
+            grant = status["grant"]
+            services = ", ".join(grant["services"])
+            echo(f"{status['armed']}: {status['left_s']:.0f} s left at {grant['speed']:.0%}, {services}")
+        elif status["ended"]:
+            echo(f"the last authority ended: {status['ended']}")
+
+
+def _bounds(text: str) -> tuple[str, list[list[float]]]:
+    """A region as `PATH=LOW:HIGH,…`."""
+    path, _, rest = text.partition("=")
+    try:
+        bounds = [[float(each) for each in part.split(":")] for part in rest.split(",")]
+    except ValueError:
+        bounds = []
+    if not path or not bounds or any(len(each) != 2 for each in bounds):
+        raise RequestError(f"--region {text!r}: write e.g. tool.position=0.1:0.4,-0.2:0.2,0.0:0.4")
+    return path, bounds

@@ -1,0 +1,41 @@
+"""The section `mcp`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import attrs
+from ibrobot_http.addresses import check_name, is_loopback
+
+from ibrobot_core.api import documented, option
+
+LEAST_TOKEN = 16
+
+
+@documented
+@attrs.frozen
+class McpOptions:
+    """Options of the section `mcp`."""
+
+    http: bool = option(True, help="whether agents connect by HTTP; `ibrobot mcp` needs none")
+    host: str = option("127.0.0.1", validator=check_name, help="address on which the port listens")
+    port: int = option(0, ge=0, le=65535, help="port for /mcp; 0: any free port")
+    names: tuple[str, ...] = option(
+        (), validator=attrs.validators.deep_iterable(check_name), help="further host names of this machine"
+    )
+    token: str | None = option(
+        None, secret=True, help=f"bearer token of agents, {LEAST_TOKEN} characters or more; by default a new one"
+    )
+    certificate: Path | None = option(None, help="TLS certificate, with the chain of its authority")
+    key: Path | None = option(None, help="private key of the certificate")
+
+    def __attrs_post_init__(self) -> None:
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate and key belong together; give both, or none of them")
+        if self.http and not is_loopback(self.host) and self.certificate is None:
+            raise ValueError(
+                f"host {self.host} can be reached from the network, which needs TLS: give certificate and key, or use "
+                "127.0.0.1 and an SSH tunnel"
+            )
+        if self.token is not None and len(self.token) < LEAST_TOKEN:
+            raise ValueError(f"token must have at least {LEAST_TOKEN} characters")

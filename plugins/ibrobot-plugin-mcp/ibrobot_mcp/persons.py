@@ -1,0 +1,121 @@
+"""A socket of this machine for `ibrobot agent …`, which its user calls to grant authority."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import stat
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from ibrobot_ros2.services import plain
+
+from ibrobot_core.api import IbrobotError
+from ibrobot_core.app import RunView
+
+SERVICES = ("/agent/arm", "/agent/disarm", "/agent/status")
+_LARGEST = 64 * 1024
+_TIMEOUT_S = 10.0
+
+
+def sockets_folder() -> Path:
+    """The folder of the sockets, which only this user may enter.
+
+    Raises:
+        IbrobotError: if another user owns it.
+    """
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    folder = Path(runtime) / "ibrobot" if runtime else Path(tempfile.gettempdir()) / f"ibrobot-{os.getuid()}"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    status = folder.stat()
+    if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
+        raise IbrobotError(f"{folder}: other users may enter it: chmod 700 {folder}, or set XDG_RUNTIME_DIR")
+    return folder
+
+
+class Persons:
+    """Answers `ibrobot agent …` of the user of this machine, in a thread, until `close`.
+
+    Args:
+        session: the run.
+    """
+
+    def __init__(self, session: RunView) -> None:
+        self._session = session
+        self.path = sockets_folder() / f"{session.config.robot.name}.{os.getpid()}"
+        self.path.unlink(missing_ok=True)
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._socket.bind(str(self.path))
+        self._socket.listen(4)
+        self._thread = threading.Thread(target=self._serve, name="persons", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop. Safe to call twice."""
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+        self._thread.join()
+        self.path.unlink(missing_ok=True)
+
+    def _serve(self) -> None:
+        while True:
+            try:
+                connection, _ = self._socket.accept()
+            except OSError:  # closed
+                return
+            with connection, contextlib.suppress(OSError, ValueError):
+                connection.settimeout(_TIMEOUT_S)
+                connection.sendall(json.dumps(self._answer(json.loads(_received(connection)))).encode())
+
+    def _answer(self, request: Any) -> Any:
+        if not isinstance(request, dict) or request.get("service") not in SERVICES:
+            return {"error": f"this socket serves {', '.join(SERVICES)}"}
+        try:
+            return {"answer": plain(self._session.bus.call(request["service"], request.get("request")))}
+        except IbrobotError as error:
+            return {"error": str(error)}
+
+
+def running() -> Iterator[Path]:
+    """The sockets of the robots that run here."""
+    for path in sorted(sockets_folder().iterdir()):
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+            try:
+                probe.connect(str(path))
+            except OSError:  # of a run that was killed
+                path.unlink(missing_ok=True)
+            else:
+                yield path
+
+
+def ask(path: Path, service: str, request: Any = None) -> Any:
+    """Call a service of a robot that runs here.
+
+    Raises:
+        IbrobotError: with the robot's reason, or if it does not answer.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.settimeout(_TIMEOUT_S)
+        try:
+            connection.connect(str(path))
+            connection.sendall(json.dumps({"service": service, "request": request}).encode())
+            connection.shutdown(socket.SHUT_WR)
+            answer = json.loads(_received(connection))
+        except (OSError, ValueError) as error:
+            raise IbrobotError(f"{path.name} does not answer: {error}") from None
+    if "error" in answer:
+        raise IbrobotError(answer["error"])
+    return answer["answer"]
+
+
+def _received(connection: socket.socket) -> bytes:
+    data = b""
+    while len(data) <= _LARGEST and (part := connection.recv(4096)):
+        data += part
+    return data

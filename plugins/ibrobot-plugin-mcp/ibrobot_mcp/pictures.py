@@ -1,0 +1,134 @@
+"""Pictures of the cameras of a run, for agents."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from typing import Any
+
+import attrs
+import numpy as np
+from ibrobot_ros2.jpeg import fits_jpeg, to_jpeg
+
+from ibrobot_core.api import CompressedImage, Image, Message, SensorError, TFMessage, TransformStamped, pixels
+from ibrobot_core.app import RunView, Subscription
+
+_TYPES = (Image.ros_type, CompressedImage.ros_type)
+_QUALITY = 85
+_DEPTH_M = 4.0
+"""Distance that is black in pictures of depth [m]."""
+_TRANSFORMS = 10
+"""Messages of transforms that are kept while pictures are waited for."""
+_FRAMES = 10
+"""Most frames between a camera and the base."""
+
+
+@attrs.frozen
+class Sight:
+    """A picture, and what is known of its camera."""
+
+    camera: str
+    stamp_ns: int
+    data: bytes
+    kind: str
+    """Its MIME type."""
+    frame: str = ""
+    note: str = ""
+    intrinsics: Mapping[str, Any] | None = None
+    """Width and height [px], and `k`, row by row [px]; None without a calibration."""
+    poses: list[Mapping[str, Any]] | None = None
+    """The transforms from the camera's frame on, as far as they are known: metres, and quaternions x, y, z, w."""
+
+
+def cameras(session: RunView) -> dict[str, str]:
+    """Name of a camera -> its topic."""
+    return {_name(topic): topic for topic, (kind, _) in session.bus.topics().items() if kind in _TYPES}
+
+
+def look(session: RunView, camera: str, timeout_s: float) -> list[Sight]:
+    """The newest pictures of one camera, or of all.
+
+    Raises:
+        SensorError: without such a camera, or if it sends no picture within `timeout_s` [s].
+    """
+    known = cameras(session)
+    if camera and camera not in known:
+        raise SensorError(f"no camera {camera[:80]!r} sends pictures; these do: {', '.join(known) or 'none'}")
+    if not known:
+        raise SensorError("no camera sends pictures")
+    with ExitStack() as stack:
+        moving = _subscribed(stack, session, "/tf", _TRANSFORMS)
+        wanted = {name: topic for name, topic in known.items() if camera in ("", name)}
+        subscribed = {name: _subscribed(stack, session, topic, 1) for name, topic in wanted.items()}
+        messages = {}
+        for name, subscription in subscribed.items():
+            received = subscription.get(timeout_s)
+            if received is None:
+                raise SensorError(f"camera {name} has sent no picture within {timeout_s:g} s")
+            messages[name] = received.message
+        fixed = session.bus.latched().get("/tf_static")
+        frames: dict[str, TransformStamped] = {}
+        for each in (*([fixed] if fixed is not None else []), *moving.drain()):
+            if isinstance(each.message, TFMessage):
+                frames |= {transform.child_frame_id: transform for transform in each.message.transforms}
+        return [_sight(session, name, wanted[name], message, frames) for name, message in messages.items()]
+
+
+def _subscribed(stack: ExitStack, session: RunView, topic: str, depth: int) -> Subscription:
+    subscription = session.bus.subscribe(topic, depth)
+    stack.callback(subscription.close)
+    return subscription
+
+
+def _name(topic: str) -> str:
+    parts = topic.strip("/").split("/")
+    return parts[1] if len(parts) > 2 and parts[0] == "camera" else topic.strip("/").replace("/", "_")
+
+
+def _sight(session: RunView, name: str, topic: str, message: Message, frames: Mapping[str, TransformStamped]) -> Sight:
+    if isinstance(message, CompressedImage):
+        header, data = message.header, message.data.tobytes()
+        kind, note = ("image/png" if "png" in message.format.lower() else "image/jpeg"), ""
+    else:
+        assert isinstance(message, Image)
+        header, kind = message.header, "image/jpeg"
+        deep = message.encoding in ("16UC1", "32FC1")
+        note = f"depth: white is 0 m, black is {_DEPTH_M:g} m and more, or unknown" if deep else ""
+        data = to_jpeg(message if fits_jpeg(message) else _eight_bits(message), _QUALITY).data.tobytes()
+    info = session.bus.latched().get(f"{topic.rpartition('/')[0]}/camera_info")
+    intrinsics = _intrinsics(info.message) if info is not None else None
+    return Sight(name, header.stamp_ns, data, kind, header.frame_id, note, intrinsics, _poses(frames, header.frame_id))
+
+
+def _eight_bits(message: Image) -> Image:
+    """A picture that JPEG can keep: without alpha, with depth from white (near) to black."""
+    array: Any = pixels(message)
+    if message.encoding in ("rgba8", "bgra8"):
+        colours = np.ascontiguousarray(array[..., :3])
+        kind = message.encoding.replace("a", "")
+        return Image(message.header, message.height, message.width, kind, 3 * message.width, colours.reshape(-1))
+    if message.encoding == "mono16":
+        grey = (array >> 8).astype(np.uint8)
+    else:
+        metres = array * (1e-3 if message.encoding == "16UC1" else 1.0)
+        near = np.where(np.isfinite(metres) & (metres > 0), 1.0 - metres / _DEPTH_M, 0.0)
+        grey = (255 * np.clip(near, 0.0, 1.0)).astype(np.uint8)
+    return Image(message.header, message.height, message.width, "mono8", message.width, grey.reshape(-1))
+
+
+def _intrinsics(info: Any) -> Mapping[str, Any]:
+    return {"width_px": info.width, "height_px": info.height, "k": [round(float(each), 4) for each in info.k]}
+
+
+def _poses(frames: Mapping[str, TransformStamped], frame: str) -> list[Mapping[str, Any]] | None:
+    transforms: list[Mapping[str, Any]] = []
+    while frame in frames and len(transforms) < _FRAMES:
+        each = frames[frame]
+        frame, shift, turn = each.header.frame_id, each.translation, each.rotation
+        transforms.append({
+            "parent": frame,
+            "child": each.child_frame_id,
+            "translation_m": [round(value, 5) for value in (shift.x, shift.y, shift.z)],
+            "quaternion": [round(value, 6) for value in (turn.x, turn.y, turn.z, turn.w)],
+        })  # fmt: skip
+    return transforms or None

@@ -1,0 +1,48 @@
+"""Prompts for the usual work."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import mcp_types as types
+
+from ibrobot_core.app import RequestError
+
+_TEXTS: Mapping[str, tuple[str, str, str]] = {
+    "pick": (
+        "Pick up an object.",
+        "object",
+        "Pick up the object named {object!r}. Call `state`, `look` and `world`. Plan with `plan_to` above the object "
+        "and then at it, with the gripper open; tell me what will move before you move. Go there with `move`, close "
+        "with `gripper`, lift, and `look` whether you have it. Stop and tell me if anything is refused.",
+    ),
+    "look_around": (
+        "Say what the robot sees.",
+        "",
+        "Call `state`, `world` and `look`, and tell me what you see, where it is in metres in the robot's base frame, "
+        "and what the robot could do with it. Move nothing.",
+    ),
+}
+"""Name -> what it is for, its argument, and its text."""
+PROMPTS = tuple(
+    types.Prompt(
+        name=name,
+        description=about,
+        arguments=[types.PromptArgument(name=argument, required=True)] if argument else [],
+    )
+    for name, (about, argument, _) in _TEXTS.items()
+)
+
+
+def prompt(name: str, arguments: Mapping[str, str]) -> str:
+    """The text of a prompt.
+
+    Raises:
+        RequestError: for an unknown prompt or a missing argument.
+    """
+    if name not in _TEXTS:
+        raise RequestError(f"there is no prompt {name[:80]!r}; the prompts are: {', '.join(_TEXTS)}")
+    _, argument, text = _TEXTS[name]
+    if argument and not arguments.get(argument):
+        raise RequestError(f"prompt {name}: give the argument {argument}")
+    return text.format(**{argument: str(arguments[argument])[:200]} if argument else {})

@@ -1,0 +1,104 @@
+"""The protocol over streamable HTTP: the application of the SDK behind the guard and limits of `ibrobot_http`."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
+
+from aiohttp import web
+from ibrobot_http.guard import Guard
+from ibrobot_http.listener import Listener
+from ibrobot_http.server import HttpServer
+from mcp.server.streamable_http_manager import StreamableHTTPSessionManager
+
+from ibrobot_mcp.server import AgentServer
+
+PATH = "/mcp"
+_LARGEST = 1024 * 1024
+"""Largest request [bytes]."""
+_SESSIONS = 16
+_IDLE_S = 600.0
+"""Time without a request after which a session ends [s]."""
+_NO_TOKEN = "this server needs the token that the run prints, as `Authorization: Bearer TOKEN`\n"
+
+
+@contextlib.asynccontextmanager
+async def http_server(server: AgentServer, listener: Listener, token: str) -> AsyncIterator[None]:
+    """Serve agents over HTTP until the block ends."""
+    manager = StreamableHTTPSessionManager(
+        server.protocol, session_idle_timeout=_IDLE_S, max_sessions=_SESSIONS, max_request_body_size=_LARGEST
+    )
+
+    async def answer(request: web.Request) -> web.StreamResponse:
+        given = request.headers.get("Authorization", "").removeprefix("Bearer ")
+        if not hmac.compare_digest(given.encode(errors="replace"), token.encode()):
+            return web.Response(status=401, text=_NO_TOKEN, headers={"WWW-Authenticate": "Bearer"})
+        response = await _asgi(manager.handle_request, request)
+        if request.method == "DELETE":
+            server.leave(request.headers.get("mcp-session-id", ""))
+        return response
+
+    app = web.Application(client_max_size=_LARGEST)
+    for method in ("GET", "POST", "DELETE"):
+        app.router.add_route(method, PATH, answer)
+    async with manager.run(), HttpServer(Guard(listener), app):
+        yield
+
+
+async def _asgi(app: Callable[[Any, Any, Any], Awaitable[None]], request: web.Request) -> web.StreamResponse:
+    """The answer of an ASGI application to a request."""
+    body = await request.read()
+    scope = {
+        "type": "http",
+        "asgi": {"version": "3.0"},
+        "http_version": "1.1",
+        "method": request.method,
+        "scheme": request.scheme,
+        "path": request.path,
+        "raw_path": request.path.encode(),
+        "root_path": "",
+        "query_string": request.query_string.encode(),
+        "headers": [(name.lower(), value) for name, value in request.raw_headers],
+    }
+    given = False
+    response: web.StreamResponse | None = None
+
+    async def receive() -> dict[str, Any]:
+        nonlocal given
+        if given:
+            await _gone(request)
+            return {"type": "http.disconnect"}
+        given = True
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    async def send(message: dict[str, Any]) -> None:
+        with contextlib.suppress(ConnectionError):  # the agent is gone
+            await pass_on(message)
+
+    async def pass_on(message: dict[str, Any]) -> None:
+        nonlocal response
+        if message["type"] == "http.response.start":
+            headers = [(name.decode("latin-1"), value.decode("latin-1")) for name, value in message.get("headers", ())]
+            response = web.StreamResponse(status=message["status"])
+            for name, value in headers:
+                if name.lower() != "content-length":
+                    response.headers.add(name, value)
+            await response.prepare(request)
+        elif message["type"] == "http.response.body":
+            assert response is not None
+            if message.get("body"):
+                await response.write(message["body"])
+            if not message.get("more_body"):
+                await response.write_eof()
+
+    await app(scope, receive, send)
+    return response if response is not None else web.Response(status=500, text="no answer\n")
+
+
+async def _gone(request: web.Request) -> None:
+    """Wait until the client has closed its connection."""
+    while request.transport is not None and not request.transport.is_closing():
+        await asyncio.sleep(0.1)

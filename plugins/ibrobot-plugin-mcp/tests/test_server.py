@@ -1,0 +1,179 @@
+"""What agents are told and may do, by the client of the SDK."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from mcp import Client, MCPError
+
+from .conftest import Rig
+
+MODES = pytest.mark.parametrize("mode", ["auto", "legacy"])
+
+
+def text(result: Any) -> str:
+    return str(result.content[0].text)
+
+
+def contents(result: Any) -> str:
+    return str(result.contents[0].text)
+
+
+@MODES
+def test_tools_are_the_services_as_they_are_declared(rig: Rig, mode: str) -> None:
+    tools = {each.name: each for each in rig.talk(lambda client: client.list_tools(), mode).tools}
+    assert {"test_move", "test_state", "test_result", "stop", "state", "look", "wait", "authority"} <= set(tools)
+    assert not {"test_forget", "agent_arm", "reset"} & set(tools), "services for persons"
+    move = tools["test_move"]
+    assert move.description == "Move. A person must grant it, see `authority`."
+    assert move.input_schema["required"] == ["to"]
+    assert move.input_schema["properties"]["to"] == {
+        "type": "number", "description": "Where to [rad].", "minimum": -1, "maximum": 1,
+    }  # fmt: skip
+    assert move.input_schema["properties"]["how"]["enum"] == ["gently", "fast"]
+    assert (move.annotations.read_only_hint, tools["test_state"].annotations.read_only_hint) == (False, True)
+
+
+@MODES
+def test_agent_reads_and_stops_but_moves_nothing_without_a_grant(rig: Rig, mode: str) -> None:
+    async def act(client: Client) -> None:
+        assert (await client.call_tool("test_state", {})).structured_content == {"answer": 0.5}
+        refused = await client.call_tool("test_move", {"to": 0.3})
+        assert refused.is_error
+        assert "may not move the robot: ask a person to grant it by /agent/arm" in text(refused)
+        assert not (await client.call_tool("stop", {})).is_error
+
+    rig.talk(act, mode)
+    assert rig.moves == ["stop"]
+
+
+@MODES
+def test_granted_motion_answers_with_its_result(rig: Rig, mode: str) -> None:
+    async def act(client: Client) -> None:
+        await client.list_tools()
+        rig.grant()
+        moved = await client.call_tool("test_move", {"to": 0.3})
+        assert moved.structured_content == {"number": 1, "result": "motion 1 has ended"}
+        assert json.loads(text(moved)) == moved.structured_content
+        waited = await client.call_tool("wait", {"tool": "test_move", "number": 1, "seconds": 0})
+        assert waited.structured_content == moved.structured_content
+
+    rig.talk(act, mode)
+    assert rig.moves[0] == 0.3
+
+
+@pytest.mark.parametrize(
+    ("tool", "arguments", "why"),
+    [
+        ("test_move", {"to": 2}, "to: 2.0 is too large, must be at most 1"),
+        ("test_move", {"to": "far"}, "to: expected a number, got 'far'"),
+        ("test_move", {}, "to: required key is missing"),
+        ("test_move", {"to": 0, "fsat": 1}, "fsat: unknown key"),
+        ("wait", {"tool": "state", "number": 1}, "'state' answers with no number; these do: test_move"),
+        ("look", {"camera": "top"}, "no camera 'top' sends pictures; these do: none"),
+        ("test_forget", {}, "there is no tool 'test_forget' in this mode; the tools are: authority, "),
+        ("no\x1b[31m tool", {}, "there is no tool"),
+    ],
+)
+def test_errors_say_what_would_be_right(rig: Rig, tool: str, arguments: Any, why: str) -> None:
+    async def act(client: Client) -> None:
+        await client.list_tools()
+        rig.grant()
+        result = await client.call_tool(tool, arguments)
+        assert result.is_error
+        assert why in text(result)
+
+    rig.talk(act)
+    assert not any(isinstance(each, float) for each in rig.moves)
+
+
+def test_agent_that_calls_too_often_is_refused_and_may_still_stop(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ibrobot_mcp.server.time.monotonic", lambda: 100.0)
+
+    async def act(client: Client) -> None:
+        results = [await client.call_tool("test_state", {}) for _ in range(150)]
+        refused = [each for each in results if each.is_error]
+        assert len(refused) == 50
+        assert text(refused[0]) == "more than 50 calls per second: call less often"
+        assert not (await client.call_tool("stop", {})).is_error
+
+    rig.talk(act)
+    assert rig.moves == ["stop"]
+
+
+def test_service_with_a_bug_is_reported_and_ends_nothing(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    rig.session.bus.unserve("/test/state")
+    from .conftest import STATE
+
+    rig.session.bus.serve(STATE, lambda request: 1 / 0)
+
+    async def act(client: Client) -> None:
+        result = await client.call_tool("test_state", {})
+        assert result.is_error
+        assert "the tool failed: ZeroDivisionError" in text(result)
+        assert not (await client.call_tool("state", {})).is_error
+
+    rig.talk(act)
+    assert not rig.session.finished.is_set()
+
+
+def test_resources_and_prompts(rig: Rig) -> None:
+    async def act(client: Client) -> None:
+        found = {each.uri for each in (await client.list_resources()).resources}
+        assert found == {"ibrobot://robot", "ibrobot://services", "ibrobot://episodes"}
+        services = json.loads(contents(await client.read_resource("ibrobot://services")))
+        assert services["/test/forget"]["persons"] is True
+        assert "no section `recording`" in contents(await client.read_resource("ibrobot://episodes"))
+        with pytest.raises(MCPError, match="there is no resource 'file:///etc/passwd'"):
+            await client.read_resource("file:///etc/passwd")
+        prompts = {each.name for each in (await client.list_prompts()).prompts}
+        assert prompts == {"pick", "look_around"}
+        asked = await client.get_prompt("pick", {"object": "cube"})
+        assert "Pick up the object named 'cube'" in str(asked.messages[0].content)
+        with pytest.raises(MCPError, match="give the argument object"):
+            await client.get_prompt("pick", {})
+
+    rig.talk(act)
+
+
+def test_pings_are_signs_of_life_of_clients_that_answer_them(rig: Rig) -> None:
+    async def act(client: Client) -> None:
+        await client.list_tools()
+        (known,) = rig.server._clients.values()
+        known.agent.heard_ns = -1
+        await rig.server._ping(known)
+        assert known.agent.heard_ns >= 0
+
+    rig.talk(act, "legacy")
+
+
+def test_clients_of_the_protocol_without_pings_are_not_alive_by_them(rig: Rig) -> None:
+    async def act(client: Client) -> None:
+        await client.list_tools()
+        (known,) = rig.server._clients.values()
+        known.agent.heard_ns = -1
+        await rig.server._ping(known)
+        assert known.agent.heard_ns == -1
+
+    rig.talk(act, "auto")
+
+
+def test_most_agents_are_bounded(rig: Rig) -> None:
+    class Session:
+        client_params = None
+
+    class Request:
+        def __init__(self, key: str) -> None:
+            self.headers = {"mcp-session-id": key}
+
+    class Context:
+        session = Session()
+
+        def __init__(self, key: str) -> None:
+            self.request = Request(key)
+
+    for number in range(100):
+        rig.server._client(Context(f"session {number}"))
+    assert len(rig.server._clients) == len(rig.authority.status().agents) == 16
