@@ -107,6 +107,14 @@ class Plugins(Protocol):
     def versions(self) -> Mapping[str, str]: ...
 
 
+class MotionScope(Protocol):
+    """The scope to which all motion keeps while an agent has authority; `launch.authority.Authority` documents it."""
+
+    speed: float
+
+    def check_path(self, positions: Vector, fastest: float) -> None: ...
+
+
 class RunView(Protocol):
     """A run, for parts that show it, publish what it does, or serve others: they read it, and may stop and end it."""
 
@@ -142,7 +150,7 @@ class RunView(Protocol):
     def stops(self) -> int: ...
 
     @property
-    def authority(self) -> Any: ...
+    def authority(self) -> MotionScope: ...
 
     @property
     def stopped_by(self) -> str: ...

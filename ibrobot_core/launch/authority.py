@@ -13,13 +13,13 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from contextvars import ContextVar
 from functools import partial
-from types import NoneType
 from typing import Any
 
 import attrs
 import numpy as np
 
 from ibrobot_core.contract.specs import joint_selection
+from ibrobot_core.control.commands import LimitSpeed
 from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported, RequestError
 from ibrobot_core.messages import Header, JointState, String
 from ibrobot_core.options import documented, option
@@ -45,7 +45,7 @@ class Grant:
     services: tuple[str, ...] = option(help="what it may call, beside services that read or stop")
     speed: float = option(0.25, ge=0.01, le=1, help="fraction of the velocity limits that nothing exceeds meanwhile")
     region: Mapping[str, tuple[tuple[float, float], ...]] = option(
-        factory=dict, help="path as in `select`, e.g. tool.position -> least and greatest value of each of its numbers"
+        factory=dict, help="path as in `select` -> its bounds"
     )
     lease: float = option(10.0, unit="s", ge=0.5, le=120, help="longest silence of the agent's client")
     agent: str = option("", help="the agent; by default the only one that is connected")
@@ -77,7 +77,7 @@ class AgentStatus:
 
 
 ARM = Service("/agent/arm", Grant, str, "Let an agent move the robot, for a time and within a scope.", persons=True)
-DISARM = Service("/agent/disarm", NoRequest, NoneType, "End an agent's authority: the arm holds.", urgent=True)
+DISARM = Service("/agent/disarm", NoRequest, type(None), "End an agent's authority: the arm holds.", urgent=True)
 STATUS = Service("/agent/status", NoRequest, AgentStatus, "Agents, and what they may do.", reads=True)
 
 
@@ -123,6 +123,8 @@ class Authority:
         """How a plan would have left the region."""
         self._numbers = itertools.count(1)
         self._ended = ""
+        self.told: list[Callable[[Mapping[str, Any]], object]] = []
+        """Called with each event of the log, which others cannot forge, as they can messages on a topic."""
         self.speed = 1.0
         """Fraction of the velocity limits that motions must keep to now."""
 
@@ -179,14 +181,13 @@ class Authority:
             self.end("another grant replaces it")
             if session.held:
                 session.bus.call("/set_mode", session.mode)
-            paths = tuple(grant.region)
-            numbers = joint_selection(session.config.robot, paths) if paths else None
+            numbers = joint_selection(session.config.robot, tuple(grant.region)) if grant.region else None
             if numbers is not None and numbers.size != len(grant.bounds):
-                raise RequestError(f"{ARM.name}: region: {', '.join(paths)} are {numbers.size} numbers")
+                raise RequestError(f"{ARM.name}: region: {', '.join(grant.region)} are {numbers.size} numbers")
             scope = Scope(chosen[0], grant, session.clock.now_ns() + ns(grant.seconds), numbers)
             if outside := self._outside(scope):
                 raise HardwareError(f"{ARM.name}: the robot is not in the region: {outside}; drive it there first")
-            session.limit_speed(grant.speed)
+            session.control.call(LimitSpeed(grant.speed))
             self.renew(scope.agent)
             self._called, self._left, self.speed, self._scope = {}, "", grant.speed, scope
         self._note("armed", scope.agent, grant=attrs.asdict(grant))
@@ -270,7 +271,7 @@ class Authority:
         self._note("ended", scope.agent, why=why)
         acts: list[Callable[[], object]] = [session.hold] if hold else []
         acts += [partial(session.bus.call, service.cancel) for service in self._called.values() if service.cancel]
-        acts.append(partial(session.limit_speed, 1.0))
+        acts.append(partial(session.control.call, LimitSpeed(1.0)))
         for act in acts:
             with suppress(IbrobotError):  # the service is of another mode, or the run ends
                 act()
@@ -319,8 +320,9 @@ class Authority:
         return ""
 
     def _note(self, event: str, agent: Agent, **facts: Any) -> None:
-        """Log an event, on the topic too, which recordings have."""
-        session = self._session
-        entry = {"stamp_ns": session.clock.now_ns(), "event": event, "agent": agent.name, **facts}
-        session.bus.publish(AGENT_LOG, String(json.dumps(entry, default=str)))
-        session.log.info("agent %s: %s", agent.name, " ".join([event, *(f"{k}={v}" for k, v in facts.items())]))
+        """Log an event, and tell those who keep it, and the topic, which recordings have."""
+        entry = {"stamp_ns": self._session.clock.now_ns(), "event": event, "agent": agent.name, **facts}
+        for call in self.told:
+            call(entry)
+        self._session.bus.publish(AGENT_LOG, String(json.dumps(entry, default=str)))
+        self._session.log.info("agent %s: %s", agent.name, " ".join([event, *(f"{k}={v}" for k, v in facts.items())]))

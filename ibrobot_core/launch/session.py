@@ -279,14 +279,6 @@ class Session:
         none = np.zeros((1, len(self.config.robot.joints)))
         self.control.write_plan(run_state.PlanRecord(self.generation, self.clock.now_ns(), 1, none[0] > 0, none))
 
-    def limit_speed(self, fraction: float) -> None:
-        """Keep all joints to a fraction of their velocity limits.
-
-        Raises:
-            IbrobotError: if it is lower than before and they move, or control has died.
-        """
-        self.control.call(commands.LimitSpeed(fraction))
-
     def raise_fault(self, fault: str) -> None:
         """Have control brake all joints and hold until a reset.
 

@@ -61,7 +61,7 @@ SUBSCRIBERS = {
             "ibrobot_planning/tasks/performing.py", "ibrobot_ros/topics.py", "ibrobot_ros2/inference.py",
             "ibrobot_diagnose/live.py", "ibrobot_kinematics/tool_pose.py", "ibrobot_web/objects.py",
             "ibrobot_web/viewer.py",
-            "ibrobot_mcp/audit.py", "ibrobot_mcp/pictures.py",
+            "ibrobot_mcp/pictures.py",
             "ibrobot_webxr/images.py", "ibrobot_webxr/server.py", "ibrobot_zenoh/shared_topics.py",
             # The world.
             "ibrobot_planning/world/clouds.py", "ibrobot_planning/world/frames.py",

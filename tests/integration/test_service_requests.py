@@ -58,7 +58,8 @@ def test_what_ends_motion_waits_for_no_other_request(run_offers: Offered):
     ends = ("estop", "cancel", "release")
     urgent = {name for name, service in run_offers.services.items() if service.urgent}
     ending = {name for name in run_offers.services if name.rpartition("/")[2] in ends}
-    assert urgent == ending - {"/record_episode/cancel"} | {"/estop/check"}  # the former ends no motion
+    # The first ends no motion; authority ends with the motion that an agent has begun.
+    assert urgent == ending - {"/record_episode/cancel"} | {"/estop/check", "/agent/disarm"}
 
 
 def test_an_orientation_that_cannot_be_kept_is_refused(runtime: Runtime):

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+import queue
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
-from ibrobot_core.api import String
-from ibrobot_core.app import AGENT_LOG, RunView
+from ibrobot_core.app import Authority, RunView
 
-_KEPT = 1000
+
+def authority_of(session: RunView) -> Authority:
+    """What agents may do in a run."""
+    authority = session.authority
+    assert isinstance(authority, Authority)
+    return authority
 
 
 def audit_path(session: RunView) -> Path:
@@ -23,35 +29,32 @@ def audit_path(session: RunView) -> Path:
 
 
 class AuditFile:
-    """Appends what is on `/agent/log` to a file, one JSON object in each line; each has the robot's name.
+    """Appends what agents do to a file, one JSON object in each line; each has the robot's name.
 
     Args:
         session: the run.
     """
 
     def __init__(self, session: RunView) -> None:
-        self._session = session
-        self._events = session.bus.subscribe(AGENT_LOG, _KEPT, String)
+        self._robot = session.config.robot.name
+        self._authority = authority_of(session)
+        self._events: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
+        self._authority.told.append(self._events.put)
         self._file: TextIO | None = None
         self.path = audit_path(session)
 
     def write(self) -> None:
         """Write what has come."""
-        events = self._events.drain()
-        if not events:
-            return
-        if self._file is None:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = self.path.open("a", encoding="utf-8")
-        for each in events:
-            assert isinstance(each.message, String)
-            entry = {"robot": self._session.config.robot.name, **json.loads(each.message.data)}
-            self._file.write(json.dumps(entry) + "\n")
-        self._file.flush()
+        while not self._events.empty():
+            if self._file is None:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                self._file = self.path.open("a", encoding="utf-8")
+            self._file.write(json.dumps({"robot": self._robot, **self._events.get()}, default=str) + "\n")
+            self._file.flush()
 
     def close(self) -> None:
         """Write what is left, and close the file."""
+        self._authority.told.remove(self._events.put)
         self.write()
-        self._events.close()
         if self._file is not None:
             self._file.close()

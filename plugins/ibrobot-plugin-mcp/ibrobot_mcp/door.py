@@ -12,8 +12,8 @@ from typing import override
 from ibrobot_http.addresses import host_names
 from ibrobot_http.listener import listen, tls_context
 
-from ibrobot_core.app import CONTROL, Authority, Pulse, RunView, SessionWorker, as_failure
-from ibrobot_mcp.audit import AuditFile
+from ibrobot_core.app import CONTROL, Pulse, RunView, SessionWorker, as_failure
+from ibrobot_mcp.audit import AuditFile, authority_of
 from ibrobot_mcp.options import McpOptions
 from ibrobot_mcp.persons import Persons
 from ibrobot_mcp.server import AgentServer
@@ -42,7 +42,7 @@ class AgentDoor(SessionWorker):
         self._options = options or McpOptions()
         where = f"port {self._options.port or 'any'}" if self._options.http else "standard input and output"
         super().__init__(session, "agents", f"a door for agents on {where}", (CONTROL,))
-        self._authority: Authority = session.authority
+        self._authority = authority_of(session)
         self.pipes: Pipes | None = None
         self.url = ""
         self.token = self._options.token or secrets.token_urlsafe(24)

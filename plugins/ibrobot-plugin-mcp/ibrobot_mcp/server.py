@@ -17,7 +17,8 @@ from mcp import MCPError
 from mcp.server.lowlevel.server import Server
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import SET_MODE, Agent, Authority, RunView, error_text
+from ibrobot_core.app import SET_MODE, Agent, RunView, error_text
+from ibrobot_mcp.audit import authority_of
 from ibrobot_mcp.prompts import PROMPTS, prompt
 from ibrobot_mcp.resources import Resources
 from ibrobot_mcp.tools import Tools, refusal
@@ -64,7 +65,7 @@ class AgentServer:
 
     def __init__(self, run: RunView) -> None:
         self._run = run
-        self._authority: Authority = run.authority
+        self._authority = authority_of(run)
         self._tools = Tools(run)
         self._resources = Resources(run)
         self._clients: dict[str, Client] = {}

@@ -14,7 +14,8 @@ import mcp_types as types
 from ibrobot_ros2.services import plain
 
 from ibrobot_core.api import IbrobotError, documented, option, seconds
-from ibrobot_core.app import Agent, Authority, RequestError, RunView, Service, fields
+from ibrobot_core.app import Agent, RequestError, RunView, Service, fields
+from ibrobot_mcp.audit import authority_of
 from ibrobot_mcp.pictures import Sight, cameras, look
 from ibrobot_mcp.schemas import request_schema
 
@@ -102,7 +103,7 @@ class Tools:
 
     def __init__(self, session: RunView) -> None:
         self._session = session
-        self._authority: Authority = session.authority
+        self._authority = authority_of(session)
         self._own: dict[str, RobotTool] = {
             "state": RobotTool(
                 Service("state", State, dict, "Mode, joints, faults, and what to do about them.", reads=True),

@@ -16,6 +16,7 @@ from typing import Any, cast, override
 import httpx2
 import pytest
 from ibrobot_mcp import ibrobot_commands, ibrobot_sections, stdio
+from ibrobot_mcp.audit import authority_of
 from ibrobot_mcp.commands import ArmAgent, DisarmAgent, ShowAgents
 from ibrobot_mcp.door import AgentDoor
 from ibrobot_mcp.options import McpOptions
@@ -181,7 +182,7 @@ def test_line_that_is_too_long_ends_the_connection(rig: Rig, monkeypatch: pytest
 def test_person_grants_by_the_command(door: AgentDoor, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(IbrobotError, match="name one agent by `agent`; connected: none"):
         ArmAgent(yes=True)()
-    agent = door.session.authority.join("claude")
+    agent = authority_of(door.session).join("claude")
     ArmAgent(yes=True, seconds=9)()
     assert "1:claude may move the robot for 9 s at 25% of its speed" in capsys.readouterr().out
     command = ShowAgents()
@@ -190,7 +191,7 @@ def test_person_grants_by_the_command(door: AgentDoor, capsys: pytest.CaptureFix
     DisarmAgent()()
     command.show(command())
     assert capsys.readouterr().out == "connected: 1:claude\nthe last authority ended: disarmed\n"
-    door.session.authority.leave(agent)
+    authority_of(door.session).leave(agent)
 
 
 @pytest.mark.parametrize("region", ["tool.position", "tool.position=", "tool.position=1", "=1:2", "a=1:2:3", "a=x:y"])
@@ -232,9 +233,9 @@ def test_folder_that_others_may_enter_is_refused(folders: Path) -> None:
 
 
 def test_log_is_a_line_for_each_event(door: AgentDoor, folders: Path) -> None:
-    agent = door.session.authority.join('x"\n{"event": "forged"}')
+    agent = authority_of(door.session).join('x"\n{"event": "forged"}')
     with pytest.raises(IbrobotError):
-        door.session.authority.call(agent, "/nothing", {"a": "\n"})
+        authority_of(door.session).call(agent, "/nothing", {"a": "\n"})
     door.step(0)
     (path,) = (folders / "states" / "ibrobot" / "agents").iterdir()
     lines = [json.loads(line) for line in path.read_text().splitlines()]
