@@ -25,10 +25,8 @@ from ibrobot_core.schema import (
     ExecutorConfig as ExecutorConfig,
     RecordingConfig as RecordingConfig,
     ModelConfig as ModelConfig,
-    TransportConfig as TransportConfig,
     Mount as Mount,
     Align as Align,
-    ImageSpec as ImageSpec,
     TASK_KEY as TASK_KEY,
     SECTIONS as SECTIONS,
 )
@@ -38,12 +36,6 @@ from ibrobot_core.config.load import (
     contract_alone as contract_alone,
 )
 from ibrobot_core.component_config import ComponentConfig as ComponentConfig, component_of as component_of
-from ibrobot_core.convert import (
-    is_literal as is_literal,
-    is_mapping as is_mapping,
-    is_sequence as is_sequence,
-    is_union as is_union,
-)
 from ibrobot_core.config.overrides import (
     Override as Override,
     apply_overrides as apply_overrides,
@@ -124,7 +116,6 @@ from ibrobot_core.interfaces.policy import (
 from ibrobot_core.interfaces.reader import find_episode as find_episode
 from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler, FrameSampler as FrameSampler
 from ibrobot_core.selection import (
-    Selection as Selection,
     Leaf as Leaf,
     JointFeature as JointFeature,
     value_at as value_at,

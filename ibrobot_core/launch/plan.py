@@ -9,7 +9,7 @@ import attrs
 
 from ibrobot_core.component import CONTROL, Component, SourceWorker, TransportLink
 from ibrobot_core.config.missing import unavailable_modes
-from ibrobot_core.descriptors import SourceDescriptor, TransportDescriptor
+from ibrobot_core.descriptors import TransportDescriptor
 from ibrobot_core.errors import ComponentFailed, NotSupported
 from ibrobot_core.interfaces.run import CommandSource
 from ibrobot_core.launch.absence import describe_absent
@@ -96,9 +96,8 @@ def mode_components(session: Session, name: str, link: TransportLink | None) -> 
 
 def _source(type_: str, *arguments: Any) -> SourceWorker:
     session: Session = arguments[0]
-    descriptor = session.registry.find("source", type_)
-    assert isinstance(descriptor, SourceDescriptor)
-    return descriptor.make(*arguments)
+    source: SourceWorker = session.registry.create("source", type_, *arguments)
+    return source
 
 
 def _sensors(session: Session) -> list[PeripheralConfig]:

@@ -31,6 +31,10 @@ ALLOWED = {
     ): "plans beside other requests",
     ("ibrobot-plugin-data/tests/test_conversion_events.py", "ibrobot_core.events"): "a line as a command prints it",
     ("ibrobot-calibration/tests/test_joint_units.py", "ibrobot_core.plugins"): "an arm that no package offers",
+    ("ibrobot-plugin-lerobot/tests/test_reader.py", "ibrobot_core.schema"): "pictures of a contract",
+    ("ibrobot-plugin-lerobot/tests/test_compose.py", "ibrobot_core.schema"): "pictures of a contract",
+    ("ibrobot-plugin-lerobot/tests/test_compose.py", "ibrobot_core.selection"): "selections of a contract",
+    ("ibrobot-plugin-zenoh/tests/test_commands.py", "ibrobot_core.schema"): "a transport of another type",
     ("ibrobot-plugin-web/tests/test_ui_jobs.py", "ibrobot_core.events"): "a line as a command prints it",
 }
 """File and module -> why its tests need it."""

@@ -28,7 +28,8 @@ from ibrobot_core.api import (
     String,
     TopicSummary,
 )
-from ibrobot_core.app import Align, ImageSpec
+from ibrobot_core.app import Align
+from ibrobot_core.schema import ImageSpec
 
 START_NS = 1_700_000_000_000_000_000
 JOINTS = ("pan", "lift", "elbow", "gripper")

@@ -90,8 +90,7 @@ class ProgramTeleop:
         keys = self._terminal() if sys.stdin.isatty() else None
         context = Context.of(self._config, self._name, self._clock, keys=keys.subscribe if keys is not None else None)
         section = self._config.teleoperation[self._name]
-        descriptor = installed_plugins().find("teleop", section.type)
-        device: Teleop = descriptor.make(section.options, context)
+        device: Teleop = installed_plugins().create("teleop", section.type, section.options, context)
         if keys is not None:
             keys.__enter__()
         try:

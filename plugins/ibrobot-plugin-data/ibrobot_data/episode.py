@@ -111,9 +111,8 @@ def make_writer(request: ConversionRequest) -> DatasetWriter:
     Raises:
         PluginError: when it is not installed.
     """
-    descriptor = installed_plugins().find("dataset", request.type)
     ctx = Context("convert", RealClock(), logging.getLogger("ibrobot.convert"), Robot("convert", ()))
-    writer: DatasetWriter = descriptor.make(request.options, ctx)
+    writer: DatasetWriter = installed_plugins().create("dataset", request.type, request.options, ctx)
     return writer
 
 

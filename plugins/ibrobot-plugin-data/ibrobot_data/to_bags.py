@@ -176,8 +176,7 @@ class _Job:
         shutil.rmtree(self._making, ignore_errors=True)
         # With a stepped clock it writes immediately, and equal datasets give equal files.
         ctx = Context("convert", SteppedClock(0), logging.getLogger("ibrobot.convert"), Robot("convert", ()))
-        descriptor = installed_plugins().find("recorder", self._request.type)
-        recorder: Recorder = descriptor.make(self._request.options, ctx)
+        recorder: Recorder = installed_plugins().create("recorder", self._request.type, self._request.options, ctx)
         counts = dict.fromkeys(contract.topics, 0)
         try:
             recorder.begin(EpisodeStart(self._making, summary.start_ns, contract.topics, metadata))

@@ -97,7 +97,7 @@ def live_pictures(config: RobotConfig, folder: Path) -> Iterator[str]:
             file, ready = folder / f"{name}.jpg", threading.Event()
             file.parent.mkdir(parents=True, exist_ok=True)
             peripheral = config.peripherals[name]
-            made = registry.find("sensor", peripheral.type).make(peripheral.options, Context.of(config, name, clock))
+            made = registry.create("sensor", peripheral.type, peripheral.options, Context.of(config, name, clock))
             thread = threading.Thread(
                 target=_follow, args=(made, name, file, ready, ended, problems), name=f"live {name}", daemon=True
             )

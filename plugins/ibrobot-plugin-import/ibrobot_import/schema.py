@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import types
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, Union, get_args, get_origin
 
 import attrs
 
@@ -18,10 +19,6 @@ from ibrobot_core.app import (
     echo,
     fields,
     installed_plugins,
-    is_literal,
-    is_mapping,
-    is_sequence,
-    is_union,
     plain,
 )
 
@@ -69,17 +66,18 @@ class _Schemas:
         """The schema of a type annotation; for `Any`, `{}`, which allows everything."""
         if kind in _SCALARS:
             return dict(_SCALARS[kind])
-        for fits, schema in (
-            (is_union, self._of_union),
-            (is_literal, lambda kind: {"enum": list(get_args(kind))}),
-            (is_sequence, self._of_sequence),
-            (is_mapping, self._of_mapping),
-            (lambda kind: isinstance(kind, type) and issubclass(kind, ComponentConfig), self._of_component),
-            (attrs.has, lambda kind: self.of_fields(fields(kind))),
+        origin = get_origin(kind) or kind
+        for origins, schema in (
+            ((types.UnionType, Union), self._of_union),
+            ((Literal,), lambda kind: {"enum": list(get_args(kind))}),
+            ((tuple, list, Sequence), self._of_sequence),
+            ((dict, Mapping), self._of_mapping),
         ):
-            if fits(kind):
+            if origin in origins:
                 return schema(kind)
-        return {}
+        if isinstance(kind, type) and issubclass(kind, ComponentConfig):
+            return self._of_component(kind)
+        return self.of_fields(fields(kind)) if attrs.has(kind) else {}
 
     def of_fields(self, known: Mapping[str, attrs.Attribute[Any]]) -> Schema:
         """The schema of a mapping with these keys."""

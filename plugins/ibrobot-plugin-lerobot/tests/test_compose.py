@@ -12,8 +12,10 @@ from hypothesis.extra import numpy as arrays
 from ibrobot_lerobot.compose import Composer
 
 from ibrobot_core.api import ActionPart, Contract, ContractError, Feature, ObservationPart
-from ibrobot_core.app import Align, FrameAssembler, ImageSpec, Selection
+from ibrobot_core.app import Align, FrameAssembler
 from ibrobot_core.contract.image import ENCODINGS
+from ibrobot_core.schema import ImageSpec
+from ibrobot_core.selection import Selection
 
 STAMP_NS = 5_000_000_000
 JOINTS = "sensor_msgs/msg/JointState"

@@ -29,7 +29,8 @@ from ibrobot_core.api import (
     RecorderError,
     pixels,
 )
-from ibrobot_core.app import Align, ImageSpec, installed_plugins
+from ibrobot_core.app import Align, installed_plugins
+from ibrobot_core.schema import ImageSpec
 
 from .conftest import CAMERA, FPS, picture, values, write
 

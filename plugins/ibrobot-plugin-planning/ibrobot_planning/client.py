@@ -21,7 +21,6 @@ from ibrobot_core.api import (
     RealClock,
     Robot,
     Transport,
-    TransportDescriptor,
     Vector3,
 )
 from ibrobot_core.app import PlanCode, Runtime, installed_plugins, single_options
@@ -93,11 +92,9 @@ class Client:
         """
         registry = installed_plugins()
         descriptor = registry.find("transport", transport or registry.default("transport"))
-        assert isinstance(descriptor, TransportDescriptor)
         parsed = single_options(descriptor.options, options or (_DEFAULT,), "transport", "options of Client.connect:")
-        made: Transport = descriptor.make(
-            parsed, Context("client", RealClock(), logging.getLogger("ibrobot.client"), Robot("client", ()))
-        )
+        ctx = Context("client", RealClock(), logging.getLogger("ibrobot.client"), Robot("client", ()))
+        made: Transport = registry.create("transport", descriptor.type, parsed, ctx)
         client = cls(lambda call: made.request(endpoint(namespace), call, _TIMEOUT_S), time.sleep, made.close)
         deadline = time.monotonic() + _CONNECT_S
         while True:  # connecting takes a moment

@@ -220,7 +220,8 @@ def _of_folder(options: Serve, registry: Registry) -> tuple[str, Policy, Context
     context = _context(Robot("server", ()))
     policies = registry.find("policy", options.type_ or "")
     overrides = [f"path={folder.absolute()}", *options.overrides]
-    policy = policies.make(single_options(policies.options, overrides, str(folder)), context)
+    parsed = single_options(policies.options, overrides, str(folder))
+    policy = registry.create("policy", policies.type, parsed, context)
     return options.name or folder.absolute().name, policy, context
 
 

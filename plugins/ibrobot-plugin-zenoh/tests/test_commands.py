@@ -33,7 +33,8 @@ from ibrobot_core.api import (
     NotSupported,
     Robot,
 )
-from ibrobot_core.app import ConfigError, RequestError, RobotConfig, TransportConfig
+from ibrobot_core.app import ConfigError, RequestError, RobotConfig
+from ibrobot_core.schema import TransportConfig
 
 from .pair import WAIT_S, free_endpoint, router, wait_for
 

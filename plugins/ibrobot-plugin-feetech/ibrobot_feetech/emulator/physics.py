@@ -41,7 +41,7 @@ class PhysicsArm:
             "emulator", self._clock, logging.getLogger("ibrobot.emulator"), config.robot, joints=arm.joints,
             period_ns=self._period_ns, seed=seed, simulation=config.simulation.options,
         )  # fmt: skip
-        hardware = registry.find("hardware", config.simulation.type).make(config.simulation.options, ctx)
+        hardware = registry.create("hardware", config.simulation.type, config.simulation.options, ctx)
         assert isinstance(hardware, SimulatedHardware)
         self._hardware = hardware
         self._arm = arm
