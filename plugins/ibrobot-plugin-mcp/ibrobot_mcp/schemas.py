@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeAliasType, get_args, get_origin
+from types import UnionType
+from typing import Any, Literal, TypeAliasType, Union, get_args, get_origin
 
 import attrs
 
-from ibrobot_core.app import Service, default_of, fields, is_literal, is_mapping, is_sequence, is_union
+from ibrobot_core.app import Service, default_of, fields
 
 _PLAIN: Mapping[Any, str] = {bool: "boolean", int: "integer", float: "number", str: "string", Path: "string"}
 _BOUNDS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
@@ -50,14 +51,15 @@ def _type(kind: Any, depth: int) -> dict[str, Any]:  # noqa: PLR0911 - one for e
         return {"type": _PLAIN[kind]}
     if kind is type(None):
         return {"type": "null"}
-    if is_literal(kind) or get_origin(kind) is Literal:
+    origin = get_origin(kind) or kind
+    if origin is Literal:
         return {"enum": list(get_args(kind))}
-    if is_union(kind):
+    if origin in (Union, UnionType):
         parts = [_type(each, depth) for each in get_args(kind)]
         return {"anyOf": [part for i, part in enumerate(parts) if part not in parts[:i]]}
-    if is_mapping(kind):
+    if origin in (dict, Mapping):
         return {"type": "object", "additionalProperties": _type((*get_args(kind), Any, Any)[1], depth)}
-    if is_sequence(kind):
+    if origin in (tuple, list, Sequence):
         items = [each for each in get_args(kind) if each is not Ellipsis]
         if len(items) > 1:
             return {"type": "array", "items": _type(items[0], depth), "minItems": len(items), "maxItems": len(items)}
