@@ -123,7 +123,7 @@ COMMANDS = {
             "convert", "damiao", "datasets", "datasets check", "datasets info", "description", "doctor", "episodes",
             "episodes delete", "episodes list", "episodes mark", "episodes repair", "episodes trash", "episodes trim",
             "explain", "export", "feetech", "gamepad",
-            "lerobot", "plan", "plugins", "preflight", "serve", "train",
+            "lerobot", "netft", "plan", "plugins", "preflight", "serve", "train",
         ),
         "",
     ),

@@ -124,7 +124,7 @@ WRONG_FILES = {
 WITHOUT_FILES = {
     "agent arm", "agent disarm", "agent status",
     "plugins check",
-    "config schema", "plugins show", "doctor", "camera list", "damiao emulate", "feetech find-port",
+    "config schema", "plugins show", "doctor", "camera list", "damiao emulate", "feetech find-port", "netft emulate",
     "gamepad list",
     "gamepad test", "gamepad udev", "lerobot list", "lerobot torque-off", "datasets pull",
 }  # fmt: skip

@@ -1,0 +1,146 @@
+"""A force sensor in the contract: what the policy saw of it is what the bag of the run gives, bit by bit."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from ibrobot_data.ticks import frames
+from ibrobot_netft.emulator import EmulatedNetFt
+from ibrobot_testing import ibrobot_command
+
+from ibrobot_core.config import load_config
+from ibrobot_core.contract.frames import FrameAssembler
+from ibrobot_core.contract.specs import Contract
+from ibrobot_core.errors import ConfigError
+from ibrobot_core.interfaces.run import LaunchRequest
+from ibrobot_core.launch.runtime import Runtime
+from ibrobot_core.launch.session import Session
+from ibrobot_core.plugins import installed_plugins
+
+pytestmark = pytest.mark.integration
+
+
+@pytest.fixture
+def device() -> Iterator[EmulatedNetFt]:
+    """A sensor whose force along z grows by 1 mN with each record."""
+    ended = threading.Event()
+
+    def measure() -> None:
+        count = 0
+        while not ended.wait(0.005):
+            count += 1
+            device.measure((0, 0, 1000 * count, -count, 0, 0))
+
+    with EmulatedNetFt() as device:
+        thread = threading.Thread(target=measure)
+        thread.start()
+        yield device
+        ended.set()
+        thread.join()
+
+
+def robot(folder: Path, device: EmulatedNetFt, policy: str = "fake", **observation: Any) -> Path:
+    limits = {"lower": -1.0, "upper": 1.0, "max_velocity": 2.0, "max_acceleration": 10.0}
+    joints = ("pan", "tilt")
+    given = {
+        "robot": {
+            "name": "tryout",
+            "joints": [{"name": each, **limits} for each in joints],
+            "groups": {"all": [*joints]},
+        },
+        "simulation": {"type": "fake"},
+        "peripherals": [
+            {
+                "name": "wrist",
+                "kind": "force",
+                "type": "netft",
+                "host": "localhost",
+                "port": device.port,
+                "silence": 60.0,
+            }
+        ],
+        "executors": {"joints": {"type": "position", "group": "all"}},
+        "models": {"keeper": {"type": policy}},
+        "control_modes": {"work": {"executors": ["joints"], "inference": {"model": "keeper"}}},
+        "default_control_mode": "work",
+        "recording": {"type": "mcap", "root": str(folder / "bags")},
+        "contract": {
+            "rate_hz": 20,
+            "observations": [
+                {"key": "observation.state", "topic": "/joint_states"},
+                {"key": "observation.force", "peripheral": "wrist", **observation},
+            ],
+            "actions": [{"key": "action", "executor": "joints", "topic": "/joints/commands"}],
+        },
+    }
+    path = folder / "tryout.yaml"
+    path.write_text(yaml.safe_dump(given, sort_keys=False))
+    return path
+
+
+def test_a_policy_sees_forces_as_the_bag_has_them(site: Any, tmp_path: Path, device: EmulatedNetFt) -> None:
+    site.add("force-keeper", "force_keeper.py")
+    registry = installed_plugins()
+    config = load_config(robot(tmp_path, device, "force_keeper"), sim=True)
+    runtime = Runtime(Session(config, registry, LaunchRequest(duration_s=2.0)))
+    runtime.start()
+    try:
+        while not runtime.wait(0.05):
+            pass
+    finally:
+        runtime.stop()
+    kept = sys.modules["force_keeper"].KEPT
+    assert len(kept) > 10
+    forces = np.array([frame.values["observation.force"][2] for frame in kept])
+    assert (np.diff(forces) >= 0).all()
+    assert len({*forces.tolist()}) > len(kept) // 2, "frames have newer and newer forces"
+
+    (path,) = (tmp_path / "bags/default/episodes").iterdir()
+    spec = Contract.from_config(config)
+    feature = spec.observations["observation.force"]
+    assert feature.names == tuple(f"wrench.{part}.{axis}" for part in ("force", "torque") for axis in ("x", "y", "z"))
+    reader = registry.open_episode(path)
+    messages = ((each.topic, each.message, each.received_ns) for each in reader.messages(spec.topics))
+    for live, later in zip(
+        kept, frames(FrameAssembler(spec), messages, [frame.stamp_ns for frame in kept]), strict=True
+    ):
+        for key, value in live.values.items():
+            np.testing.assert_array_equal(value, later.values[key], strict=True)
+    reader.close()
+
+    out = tmp_path / "dataset"
+    line = ["convert", str(path), "--out", str(out), "--outcome", "unknown", "--jobs", "1"]
+    subprocess.run([*ibrobot_command(), *line], check=True, capture_output=True, timeout=120)
+    assert "observation.force" in (out / "meta/info.json").read_text()
+
+
+@pytest.mark.parametrize(
+    ("observation", "message"),
+    [
+        ({"select": ["wrench.farce.x"]}, r"Wrench has no field 'farce'.*did you mean 'force'"),
+        ({"topic": "/wrench"}, r"comes from peripheral 'wrist'; give one or the other"),
+        ({"image": {"resize": [4, 4]}}, r"needs a camera; /force/wrist/wrench carries geometry_msgs/msg/WrenchStamped"),
+        ({"peripheral": "wirst"}, r"'wirst', did you mean 'wrist'"),
+    ],
+)
+def test_what_a_contract_says_wrongly_of_a_force_sensor_is_named(
+    tmp_path: Path, observation: dict[str, Any], message: str
+) -> None:
+    with EmulatedNetFt() as device, pytest.raises(ConfigError, match=message):
+        load_config(robot(tmp_path, device, **observation), sim=True)
+
+
+def test_torques_alone_are_selected(tmp_path: Path) -> None:
+    with EmulatedNetFt() as device:
+        config = load_config(robot(tmp_path, device, select=["wrench.torque"]), sim=True)
+    assert Contract.from_config(config).observations["observation.force"].shape == (3,)
+    assert math.prod(Contract.from_config(config).observations["observation.state"].shape) == 2
