@@ -132,7 +132,9 @@ def test_wrong_values_are_an_error_until_the_sensor_measures_again() -> None:
         with pytest.raises(SensorError, match=r"force sensor wrist .*: it reports the error 0x80010000"):
             sensor.read(PATIENCE_S)
         device.measure((0, 0, 1_000_000, 0, 0, 0))
-        assert sensor.read(PATIENCE_S).wrench.force.z == 1.0
+        while (message := read_or_none(sensor)) is None:
+            continue
+        assert message.wrench.force.z == 1.0
 
 
 def test_a_sensor_without_power_is_an_error_and_is_asked_again_when_it_is_back() -> None:
