@@ -23,7 +23,8 @@ FOREIGN = OF_OTHERS | {"--upgrade", "--reload", "--no-deps", "--version", "--hel
 """Options of other programs, e.g. pip, and those that each command has."""
 KNOWN = tuple(cli.list_commands(click.Context(cli)))
 FIRST_HOUR = {
-    f"ibrobot_{name}" for name in ("core", "camera", "data", "feetech", "keyboard", "lerobot", "mcap", "mujoco", "web")
+    f"ibrobot_{name}"
+    for name in ("core", "calibration", "camera", "data", "feetech", "keyboard", "lerobot", "mcap", "mujoco", "web")
 }
 """Packages whose commands a beginner types."""
 _CAMERA, _FEETECH, _LEROBOT, _MCAP, _WEB = (
