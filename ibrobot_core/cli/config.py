@@ -44,6 +44,7 @@ class CheckConfig(ShowConfig):
     as_json: bool = option(False, typed="--json", help="print a list of {file, line, path, message}")
 
     def __call__(self) -> None:
+        from ibrobot_core.contract.specs import Contract
         from ibrobot_core.launch.absence import absent_sensors, describe_absent
         from ibrobot_core.launch.models import check_models
 
@@ -71,5 +72,8 @@ class CheckConfig(ShowConfig):
         if absent := describe_absent(absent_sensors(robot, installed_plugins())):
             notes.append(f"runs start without {absent}")
         notes += [f"{problem.path}: {problem.message}" for problem in uncalibrated]
+        for spec, part in zip(robot.contract.observations, Contract.from_config(robot).observation_parts, strict=True):
+            if part.align != spec.align:
+                notes.append(f"{part.key}: a {part.type} has no header: {part.topic} goes by the time of receipt")
         for line in (*(f"note: {note}" for note in notes), *models):
             echo(line)

@@ -95,3 +95,14 @@ def test_show_fills_in_the_defaults_and_loads_again(ibrobot: Ibrobot, robot: Pat
     }
     robot.write_text(shown.out)
     assert ibrobot("config", "show", "mini.yaml").out == shown.out
+
+
+@pytest.mark.parametrize("align", ["", ", align: {stamp: receive}"])
+def test_a_type_without_a_header_is_said_to_go_by_receipt(ibrobot: Ibrobot, robot: Path, align: str) -> None:
+    observation = "key: observation.touch, topic: /touch, type: std_msgs/msg/Float32MultiArray, select: [data.0]"
+    robot.write_text(f"{robot.read_text()}\ncontract: {{observations: [{{{observation}{align}}}]}}\n")
+
+    ran = ibrobot("config", "check", "mini.yaml")
+
+    note = "note: observation.touch: a std_msgs/msg/Float32MultiArray has no header: /touch goes by the time of receipt"
+    assert (ran.code, ran.out.splitlines()[3:]) == (0, [] if align else [note]), "who says so needs no note"
