@@ -47,7 +47,7 @@ class Grant:
     region: Mapping[str, tuple[tuple[float, float], ...]] = option(
         factory=dict, help="path as in `select` -> its bounds"
     )
-    lease: float = option(10.0, unit="s", ge=0.5, le=120, help="longest silence of the agent's client")
+    lease: float = option(10.0, unit="s", ge=1, le=120, help="longest silence of the agent's client")
     agent: str = option("", help="the agent; by default the only one that is connected")
     by: str = option("", help="who grants it, for the log")
 
@@ -258,7 +258,7 @@ class Authority:
         if (agent := ACTING.get()) is not None:
             self._granted(agent, what)
         else:
-            self.end(f"{what} by another", hold=False)
+            self.end(f"{what} by another")
 
     def end(self, why: str, *, hold: bool = True) -> None:
         """End the authority, if there is one; the robot then holds until a person goes on, if `hold`."""

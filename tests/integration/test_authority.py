@@ -211,6 +211,16 @@ def test_mode_that_a_person_enters_ends_the_authority(run: AgentRun) -> None:
     assert run.moved(100) == 0.0
 
 
+def test_person_who_enters_the_present_mode_stops_what_the_agent_has_begun(run: AgentRun) -> None:
+    run.grant(speed=0.1)
+    run.go("shoulder_pan=1.2,gripper=1.7")
+    run.ticks(20)
+    run.session.bus.call("/set_mode", "moveit_planning")
+    run.ticks(10)
+    assert run.moved(200) == 0.0
+    assert not run.session.held
+
+
 def test_agent_enters_modes_that_are_granted(run: AgentRun) -> None:
     run.grant(services=(GO_TO, "/set_mode"))
     run.authority.call(run.agent, "/set_mode", "web")

@@ -50,7 +50,7 @@ class ArmAgent(_OfRun):
     region: tuple[str, ...] = option(
         (), typed="--region PATH=LOW:HIGH,…", help="e.g. tool.position=0.1:0.4,-0.2:0.2,0.0:0.4 [m]"
     )
-    lease: float = option(10.0, unit="s", ge=0.5, le=120, help="longest silence of the agent's program")
+    lease: float = option(10.0, unit="s", ge=1, le=120, help="longest silence of the agent's program")
     agent: str = option("", typed="--agent NAME", help="the agent; needed if several are connected")
     yes: bool = option(False, typed="--yes", help="do not ask")
 

@@ -37,8 +37,8 @@ _WAITING = 32
 _AGENTS = 16
 """Most agents that are connected; the one that has been silent for longest is disconnected for a new one."""
 _START_S = 0.05
-_PING_S = 0.5
-"""Interval of pings, and the time for their answers [s]."""
+_PING_S, _PONG_S = 0.5, 2.0
+"""Interval of pings, and the longest wait for their answers [s]."""
 
 
 @attrs.define(eq=False)
@@ -99,7 +99,7 @@ class AgentServer:
         if client.session is None:
             return
         with suppress(MCPError, anyio.ClosedResourceError, anyio.BrokenResourceError, TimeoutError):
-            async with asyncio.timeout(_PING_S):
+            async with asyncio.timeout(_PONG_S):
                 await client.session.send_ping()
             self._authority.renew(client.agent)
 

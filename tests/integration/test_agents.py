@@ -1,0 +1,344 @@
+"""Agents at a simulated arm: hostile ones, those that are killed, frozen or out of reach, and one that works."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import hostile_agents
+import numpy as np
+import pytest
+from ibrobot_mcp.door import AgentDoor
+from ibrobot_mcp.stdio import Pipes
+from mcp import Client, StdioServerParameters
+
+from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
+from ibrobot_core.launch.authority import Grant
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+AGENT = Path(__file__).parents[1] / "shared" / "piped_agent.py"
+PATIENCE_S = 60.0
+
+
+def test_hostile_agents_move_nothing_beyond_their_grants_and_memory_stays_flat() -> None:
+    memory: list[float] = []
+    run = hostile_agents.attacked(2_000, seed=0, on_part=memory.append)
+    calls = sum(count for outcome, count in run.calls.items() if not outcome.startswith("person"))
+    assert calls == 2_000
+    assert run.calls["moves"] > 20
+    assert run.moved > 1.0, "they are granted motion, too"
+    assert run.calls["refused"] > 500
+    assert memory[-1] - memory[2] < 30.0, f"memory grows: {memory} MB"
+
+
+class Watched:
+    """A run in real time whose agent is at pipes, in a process of its own."""
+
+    def __init__(self, lease: float) -> None:
+        overrides = ("simulation.scene={type: empty}", "mcp={http: false}")
+        config = load_config(
+            CONFIGS / "so101_blind.yaml", sim=True, mode="moveit_planning", overrides=overrides,
+            registry=installed_plugins(),
+        )  # fmt: skip
+        self.runtime = Runtime(Session(config, installed_plugins(), LaunchRequest()))
+        self.session = self.runtime.session
+        self.door = next(each for each in self.runtime.plan.components if isinstance(each, AgentDoor))
+        source, self.to_door = os.pipe()
+        self.from_door, sink = os.pipe()
+        self.door.pipes = Pipes(source, sink)
+        self.runtime.start()
+        goal = "shoulder_pan=1.9"
+        self.agent = subprocess.Popen(
+            [sys.executable, str(AGENT), str(self.from_door), str(self.to_door), goal],
+            pass_fds=(self.from_door, self.to_door), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        )  # fmt: skip
+        os.close(self.from_door)
+        os.close(self.to_door)
+        assert self.agent.stdout is not None
+        assert self.agent.stdin is not None
+        assert self.agent.stdout.readline() == b"ready\n"
+        self.session.bus.call("/agent/arm", Grant(600.0, ("/planning/go_to",), speed=0.05, lease=lease))
+        self.agent.stdin.write(b"go\n")
+        self.agent.stdin.flush()
+        self.until(lambda: self.pan > 0.02)
+
+    @property
+    def pan(self) -> float:
+        """The commanded position of `shoulder_pan` [rad]."""
+        assert self.session.state is not None
+        return float(self.session.state.command[0])
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        """Let time pass until a condition holds."""
+        states, waited = self.session.watch_states(), 0
+        while not condition():
+            states.get(1.0)
+            waited += 1
+            assert waited < 100 * PATIENCE_S, "it does not come about"
+
+    def holds(self) -> None:
+        """Check that the arm holds, far from its goal, and nobody has authority."""
+        self.until(lambda: not self.session.authority.status().armed)
+        states = self.session.watch_states()
+        for _ in range(20):
+            states.get(1.0)
+        rest = self.pan
+        for _ in range(50):
+            states.get(1.0)
+        assert self.pan == rest
+        assert rest < 1.0
+        assert self.session.held
+
+    def close(self) -> None:
+        self.agent.kill()
+        self.agent.wait()
+        for pipe in (self.agent.stdin, self.agent.stdout):
+            assert pipe is not None
+            pipe.close()
+        self.runtime.stop()
+
+
+@pytest.fixture
+def watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Watched]]:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    made: list[Watched] = []
+
+    def make(lease: float) -> Watched:
+        made.append(Watched(lease))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()
+
+
+def test_arm_goes_on_while_its_agent_answers_pings(watched: Callable[..., Watched]) -> None:
+    run = watched(3.0)
+    run.until(lambda: run.pan > 0.6)  # at 0.15 rad/s, that takes longer than the lease
+    assert run.session.authority.status().armed == "1:piped"
+
+
+def test_arm_holds_when_its_agent_is_killed(watched: Callable[..., Watched]) -> None:
+    run = watched(100.0)
+    run.agent.kill()
+    run.holds()
+    assert run.session.finished.wait(PATIENCE_S), "the run of an agent at pipes ends with it"
+
+
+def test_arm_holds_when_its_agent_is_frozen_and_stays_so_when_it_thaws(watched: Callable[..., Watched]) -> None:
+    run = watched(3.0)
+    run.agent.send_signal(signal.SIGSTOP)
+    run.holds()
+    assert "has been silent for" in run.session.authority.status().ended
+    at = run.pan
+    run.agent.send_signal(signal.SIGCONT)
+    states = run.session.watch_states()
+    for _ in range(50):
+        states.get(1.0)
+    assert run.pan == at
+
+
+class Relay:
+    """Passes bytes between an agent and a server, until it is cut."""
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+        self.cut = threading.Event()
+        self._started = threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()))
+        self._thread.start()
+        self._started.wait(PATIENCE_S)
+
+    async def _serve(self) -> None:
+        self._loop, self._end = asyncio.get_running_loop(), asyncio.Event()
+        server = await asyncio.start_server(self._relay, "127.0.0.1", 0)
+        self.port = server.sockets[0].getsockname()[1]
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._writers: list[asyncio.StreamWriter] = []
+        self._started.set()
+        await self._end.wait()
+        tasks = tuple(self._tasks)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        for writer in self._writers:
+            writer.close()
+        await asyncio.gather(*(writer.wait_closed() for writer in self._writers), return_exceptions=True)
+        server.close()
+
+    async def _relay(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        far_reader, far_writer = await asyncio.open_connection("127.0.0.1", self._port)
+        self._writers += [writer, far_writer]
+        for source, sink in ((reader, far_writer), (far_reader, writer)):
+            task = asyncio.create_task(self._pass(source, sink))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+    async def _pass(self, source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
+        while data := await source.read(4096):
+            if not self.cut.is_set():  # what is cut neither arrives nor ends
+                sink.write(data)
+        sink.close()
+
+    def close(self) -> None:
+        self._loop.call_soon_threadsafe(self._end.set)
+        self._thread.join()
+
+
+@pytest.mark.parametrize("mode", ["auto", "legacy"])
+def test_arm_holds_when_its_agent_is_out_of_reach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str) -> None:
+    import httpx2
+    from mcp.client.streamable_http import streamable_http_client
+
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    overrides = ("simulation.scene={type: empty}", "mcp={}")
+    config = load_config(
+        CONFIGS / "so101_blind.yaml",
+        sim=True,
+        mode="moveit_planning",
+        overrides=overrides,
+        registry=installed_plugins(),
+    )
+    runtime = Runtime(Session(config, installed_plugins(), LaunchRequest()))
+    session = runtime.session
+    door = next(each for each in runtime.plan.components if isinstance(each, AgentDoor))
+    runtime.start()
+    relay = Relay(int(door.url.split(":")[2].split("/")[0]))
+
+    async def talk() -> None:
+        url = f"http://127.0.0.1:{relay.port}/mcp"
+        headers = {"Authorization": f"Bearer {door.token}", "Host": door.url.split("/")[2]}
+        async with (
+            httpx2.AsyncClient(headers=headers, timeout=httpx2.Timeout(PATIENCE_S)) as http,
+            Client(streamable_http_client(url, http_client=http), mode=mode) as client,
+        ):
+            await client.list_tools()
+            session.bus.call("/agent/arm", Grant(600.0, ("/planning/go_to",), speed=0.05, lease=3.0))
+            asking = asyncio.create_task(client.call_tool("go_to", {"goal": "shoulder_pan=1.9"}))
+            while session.state is None or session.state.command[0] < 0.02:
+                await asyncio.sleep(0)
+            relay.cut.set()
+            while session.authority.status().armed:
+                await asyncio.sleep(0)
+            asking.cancel()
+            relay.cut.clear()
+            await asyncio.gather(asking, return_exceptions=True)
+
+    try:
+        asyncio.run(talk())
+        states = session.watch_states()
+        for _ in range(20):
+            states.get(1.0)
+        assert session.state is not None
+        rest = session.state.command.copy()
+        for _ in range(50):
+            states.get(1.0)
+        assert (session.state.command == rest).all()
+        assert rest[0] < 1.0
+        assert session.held
+        assert "silent for" in session.authority.status().ended
+    finally:
+        relay.close()
+        runtime.stop()
+
+
+UPRIGHT = [3.14159, 0.0, 0.0]
+
+
+class Worker:
+    """A scripted agent, by the client of the SDK."""
+
+    def __init__(self, client: Client) -> None:
+        self.client = client
+
+    async def call(self, name: str, /, **arguments: Any) -> Any:
+        result = await self.client.call_tool(name, arguments)
+        assert not result.is_error, result.content
+        return result.structured_content
+
+    async def step(self, tool: str, **arguments: Any) -> bool:
+        """Perform a step; returns whether it succeeded."""
+        answer = await self.call(tool, **arguments)
+        while answer["result"] is None:
+            answer = await self.call("wait", tool="task_step", number=answer["number"])
+        return bool(answer["result"]["outcome"] == "SUCCEEDED")
+
+    async def above(self, name: str, height: float, turn: float = 0.0, tolerance: float = 0.2) -> bool:
+        goal = {"object": name, "xyz": [0, 0, height], "rpy": [*UPRIGHT[:2], turn], "angle_tolerance": tolerance}
+        return await self.step("move", **goal)
+
+    async def grasp(self, name: str) -> bool:
+        """Go to an object, and close the gripper on it."""
+        down = {"line": [{"object": name, "axis": "down", "angle_tolerance": 0.2}], "touch": [name, "table"]}
+        for turn in (0.0, 1.5708, -1.5708, 3.14159):
+            if await self.above(name, 0.07, turn) and await self.step("move", **down):
+                return await self.step("gripper", position=-0.1, grasp=name)
+        return False
+
+    async def place(self, name: str) -> Any:
+        """Where an object is by the scene's ground truth [m]."""
+        world = await self.call("world")
+        return world["answer"]["objects"][name]["pose"]["position"]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("mode", ["auto", "legacy"])
+def test_scripted_agent_does_ten_tasks_of_increasing_length(tmp_path: Path, mode: str) -> None:
+    """Each task goes on from the one before; the scene's ground truth counts."""
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "XDG_STATE_HOME": str(tmp_path)}
+    arguments = ["-m", "ibrobot_core.cli.command", "mcp", "so101_pick_cube", "--sim"]
+    command = [sys.executable, "-c", "from ibrobot_core.cli.command import main; main()", *arguments[2:]]
+    parameters = StdioServerParameters(command=command[0], args=command[1:], env=environment)
+    succeeded: list[bool] = []
+
+    async def work() -> None:
+        async with Client(parameters, mode=mode) as client:
+            agent = Worker(client)
+            assert (await agent.call("state"))["mode"] == "planned"
+            grant = [*command[:3], "agent", "arm", "--yes", "--speed", "0.6", "--seconds", "600"]
+            await asyncio.to_thread(subprocess.run, grant, env=environment, check=True, capture_output=True)
+            joints = {"shoulder_pan": 0.3}
+            start = await agent.place("cube")
+
+            async def position(joint: str) -> float:
+                return float((await agent.call("state"))["joints"][joint]["position_rad"])
+
+            succeeded.append((await agent.call("plan_to", goal="home"))["answer"]["code"] == "SUCCESS")
+            succeeded.append(await agent.step("gripper", position=0.6) and await position("gripper") > 0.55)
+            await agent.step("move", joints=joints)
+            succeeded.append(abs(await position("shoulder_pan") - 0.3) < 0.02)
+            await agent.step("move", joints={"shoulder_pan": -0.3})
+            await agent.step("move", joints=joints)
+            succeeded.append(abs(await position("shoulder_pan") - 0.3) < 0.02)
+            succeeded.append(await agent.above("cube", 0.12, tolerance=0.4))
+            succeeded.append(await agent.grasp("cube"))
+            await agent.step("move", line=[{"xyz": [0, 0, 0.07], "relative": True}], touch=["table"])
+            succeeded.append((await agent.place("cube"))["z"] > start["z"] + 0.04)
+            over = {"object": "bin_floor", "xyz": [0, 0, 0.09], "axis": "down", "angle_tolerance": 0.3}
+            await agent.step("move", **over)
+            cube, floor = await agent.place("cube"), await agent.place("bin_floor")
+            succeeded.append(np.hypot(cube["x"] - floor["x"], cube["y"] - floor["y"]) < 0.06)
+            await agent.step("gripper", position=0.6, release="cube")
+            for _ in range(100):
+                if (await agent.call("state"))["scene_succeeded"]:
+                    break
+            succeeded.append(bool((await agent.call("state"))["scene_succeeded"]))
+            await agent.step("move", pose="rest")
+            succeeded.append(abs(await position("shoulder_pan")) < 0.05)
+
+    asyncio.run(work())
+    assert succeeded == [True] * 10
+    (log,) = (tmp_path / "ibrobot" / "agents").iterdir()
+    events = [json.loads(line)["event"] for line in log.read_text().splitlines()]
+    assert re.fullmatch(r"joined armed( called)+ left ended", " ".join(events))
