@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from contextvars import copy_context
 from functools import partial
 from typing import Any
 
 import anyio
-import anyio.to_thread
 import attrs
 import mcp_types as types
 from mcp import MCPError
@@ -50,7 +51,10 @@ class Client:
     """Sends it requests, e.g. pings."""
     allowance: float = _BURST
     counted_s: float = 0.0
-    waiting: int = 0
+    waiting: set[Callable[[], Any]] = attrs.field(factory=set)
+    """Calls that are not done yet."""
+    waiting_stops: set[Callable[[], Any]] = attrs.field(factory=set)
+    """Stops, likewise."""
 
 
 class AgentServer:
@@ -70,8 +74,8 @@ class AgentServer:
         self._resources = Resources(run)
         self._clients: dict[str, Client] = {}
         """Session of the transport, empty where it has none -> the client."""
-        self._calls = anyio.CapacityLimiter(_OPEN)
-        self._stops = anyio.CapacityLimiter(2)
+        self._calls = ThreadPoolExecutor(_OPEN, "agents' calls")
+        self._stops = ThreadPoolExecutor(2, "agents' stops")
         self.protocol: Server[Any] = Server(
             "ibrobot",
             version=run.registry.versions().get("ibrobot-plugin-mcp", ""),
@@ -113,6 +117,8 @@ class AgentServer:
         """Disconnect all clients."""
         for key in tuple(self._clients):
             self.leave(key)
+        for each in (self._calls, self._stops):
+            each.shutdown(wait=False, cancel_futures=True)
 
     async def _heard(self, ctx: Any, call_next: Callable[[Any], Awaitable[Any]]) -> Any:
         """Note a sign of life of a known client."""
@@ -148,38 +154,48 @@ class AgentServer:
         if (tool := tools.get(params.name)) is None:
             known = ", ".join(sorted(tools))
             return _failed(f"there is no tool {params.name[:80]!r} in this mode; the tools are: {known}")
-        if not tool.urgent and (busy := self._busy(client)):
+        if busy := self._busy(client, tool.urgent):
             return _failed(busy)
-        limiter = self._stops if tool.urgent else self._calls
-        client.waiting += 1
         try:
             run = partial(tool.run, client.agent, params.arguments or {})
-            content, structured = await anyio.to_thread.run_sync(run, limiter=limiter, abandon_on_cancel=True)
+            content, structured = await self._carried_out(client, run, self._stops if tool.urgent else self._calls)
         except IbrobotError as error:
             return types.CallToolResult(content=refusal(error), is_error=True)
         except Exception as error:
             self._run.log.exception("tool %s failed", params.name[:80])
             return _failed(f"the tool failed: {error_text(error)}; that is a fault of the robot's program")
-        finally:
-            client.waiting -= 1
         return types.CallToolResult(content=content, structured_content=structured)
 
-    def _busy(self, client: Client) -> str:
+    async def _carried_out[T](self, client: Client, call: Callable[[], T], threads: ThreadPoolExecutor) -> T:
+        """Carry out a call in a thread. One that has begun keeps its thread, even if its client cancels it."""
+        waiting = client.waiting_stops if threads is self._stops else client.waiting
+        waiting.add(call)
+        future = threads.submit(copy_context().run, call)
+        future.add_done_callback(lambda _: waiting.discard(call))
+        return await asyncio.wrap_future(future)
+
+    def _busy(self, client: Client, urgent: bool = False) -> str:
         """Why a client must wait; empty if it need not."""
+        if urgent:
+            return f"{_WAITING} stops wait already" if len(client.waiting_stops) >= _WAITING else ""
         now_s = time.monotonic()
         client.allowance = min(_BURST, client.allowance + (now_s - client.counted_s) * _PER_SECOND)
         client.counted_s = now_s
         if client.allowance < 1.0:
             return f"more than {_PER_SECOND:g} calls per second: call less often"
         client.allowance -= 1.0
-        return f"{_WAITING} calls wait for their answers: wait for them" if client.waiting >= _WAITING else ""
+        return f"{_WAITING} calls wait for their answers: wait for them" if len(client.waiting) >= _WAITING else ""
 
     async def _list_resources(self, ctx: Any, params: Any) -> types.ListResourcesResult:
         return types.ListResourcesResult(resources=self._resources.all())
 
     async def _read_resource(self, ctx: Any, params: types.ReadResourceRequestParams) -> types.ReadResourceResult:
+        client = self._client(ctx)
+        if busy := self._busy(client):
+            raise MCPError(code=types.INTERNAL_ERROR, message=busy)
         try:
-            kind, text = await anyio.to_thread.run_sync(self._resources.read, str(params.uri), limiter=self._calls)
+            read = partial(self._resources.read, str(params.uri))
+            kind, text = await self._carried_out(client, read, self._calls)
         except IbrobotError as error:
             raise MCPError(code=types.INVALID_PARAMS, message=str(error)) from None
         contents = types.TextResourceContents(uri=params.uri, mime_type=kind, text=text)
@@ -199,7 +215,12 @@ class AgentServer:
 
 def _key(ctx: Any) -> str:
     """What tells the clients of a transport apart: the session of HTTP; empty for standard input, and without one."""
-    return ctx.request.headers.get("mcp-session-id", "http") if ctx.request is not None else ""
+    return http_key(ctx.request.headers.get("mcp-session-id", "")) if ctx.request is not None else ""
+
+
+def http_key(session: str) -> str:
+    """What tells a client of HTTP apart, none of which is that of standard input, whatever session it names."""
+    return f"http {session}"
 
 
 def _failed(why: str) -> types.CallToolResult:

@@ -14,7 +14,7 @@ from ibrobot_http.listener import Listener
 from ibrobot_http.server import HttpServer
 from mcp.server.streamable_http_manager import StreamableHTTPSessionManager
 
-from ibrobot_mcp.server import AgentServer
+from ibrobot_mcp.server import AgentServer, http_key
 
 PATH = "/mcp"
 _LARGEST = 1024 * 1024
@@ -38,7 +38,7 @@ async def http_server(server: AgentServer, listener: Listener, token: str) -> As
             return web.Response(status=401, text=_NO_TOKEN, headers={"WWW-Authenticate": "Bearer"})
         response = await _asgi(manager.handle_request, request)
         if request.method == "DELETE":
-            server.leave(request.headers.get("mcp-session-id", ""))
+            server.leave(http_key(request.headers.get("mcp-session-id", "")))
         return response
 
     app = web.Application(client_max_size=_LARGEST)

@@ -179,6 +179,30 @@ def test_line_that_is_too_long_ends_the_connection(rig: Rig, monkeypatch: pytest
     agent.close()
 
 
+def test_agent_that_closes_the_pipe_of_its_answers_is_disconnected(rig: Rig) -> None:
+    agent = PipedAgent(rig)
+    agent.write(json.dumps(HELLO).encode() + b"\n")
+    agent.read()
+    agent._answers.close()
+    agent._thread.join(timeout=10)
+    served = agent._thread.is_alive()
+    agent.close()
+    assert not served
+
+
+def test_agent_that_reads_no_answers_is_disconnected_before_they_fill_the_memory(rig: Rig) -> None:
+    agent = PipedAgent(rig)
+    agent.write(json.dumps(HELLO).encode() + b"\n")
+    agent.read()
+    call = json.dumps({"jsonrpc": "2.0", "id": 2, "method": "tools/list"}).encode() + b"\n"
+    with contextlib.suppress(BrokenPipeError):
+        agent.write(call * 2_000)
+    agent._thread.join(timeout=10)
+    served = agent._thread.is_alive()
+    agent.close()
+    assert not served
+
+
 def test_person_grants_by_the_command(door: AgentDoor, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(IbrobotError, match="name one agent by `agent`; connected: none"):
         ArmAgent(yes=True)()

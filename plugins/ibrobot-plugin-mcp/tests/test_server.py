@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import threading
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from ibrobot_mcp.server import http_key
 from mcp import Client, MCPError
 
-from .conftest import Rig
+from .conftest import STATE, Rig
 
 MODES = pytest.mark.parametrize("mode", ["auto", "legacy"])
 
@@ -105,8 +109,6 @@ def test_agent_that_calls_too_often_is_refused_and_may_still_stop(rig: Rig, monk
 
 def test_service_with_a_bug_is_reported_and_ends_nothing(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
     rig.session.bus.unserve("/test/state")
-    from .conftest import STATE
-
     rig.session.bus.serve(STATE, lambda request: 1 / 0)
 
     async def act(client: Client) -> None:
@@ -158,6 +160,46 @@ def test_clients_of_the_protocol_without_pings_are_not_alive_by_them(rig: Rig) -
         assert known.agent.heard_ns == -1
 
     rig.talk(act, "auto")
+
+
+def test_calls_that_an_agent_cancels_keep_their_threads_until_they_are_done(rig: Rig) -> None:
+    rig.session.bus.unserve(STATE.name)
+    begun: list[float] = []
+    release = threading.Event()
+
+    def slow(_: Any) -> float:
+        begun.append(0.0)
+        release.wait(30)
+        return 0.5
+
+    rig.session.bus.serve(STATE, slow)
+
+    async def act(client: Client) -> None:
+        for _ in range(60):
+            call = asyncio.create_task(client.call_tool("test_state", {}))
+            await asyncio.sleep(0.001)
+            call.cancel()
+            await asyncio.gather(call, return_exceptions=True)
+        assert not (await client.call_tool("stop", {})).is_error
+        release.set()
+
+    rig.talk(act)
+    assert len(begun) <= 8
+    assert rig.moves == ["stop"]
+
+
+@pytest.mark.parametrize("session", ["", " ", "http", "x"])
+def test_client_of_http_is_never_that_of_the_pipes(rig: Rig, session: str) -> None:
+    class Piped:
+        session = SimpleNamespace(client_params=None)
+        request = None
+
+    class Web(Piped):
+        request = SimpleNamespace(headers={"mcp-session-id": session})
+
+    assert rig.server._client(Piped()).agent is not rig.server._client(Web()).agent
+    rig.server.leave(http_key(session))
+    assert rig.authority.status().agents == ("1:agent",)
 
 
 def test_most_agents_are_bounded(rig: Rig) -> None:
