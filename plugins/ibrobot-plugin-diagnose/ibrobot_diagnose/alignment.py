@@ -193,7 +193,9 @@ class Moved:
         """Why it is uncertain; empty if it is not."""
         if self.rich < 4:
             return f"only {self.rich} of {AREAS[0] * AREAS[1]} areas of the picture show something that stands still"
-        if self.is_other_view or self.found >= max(3, 0.3 * self.rich):
+        # A few areas may fit elsewhere by chance, but hardly in their place.
+        least = 3 if self.in_place == self.found else 5
+        if self.is_other_view or self.found >= max(least, 0.3 * self.rich):
             return ""
         return f"only {self.found} of {self.rich} areas are found again"
 

@@ -71,21 +71,23 @@ def still(config: RobotConfig) -> RobotConfig:
 
 
 def look(
-    config: RobotConfig, seconds: float, *, lockstep: bool = False, tell: Callable[[str], None] = lambda what: None
-) -> LiveWindow:
+    config: RobotConfig, seconds: float, *, lockstep: bool = False, seed: int = 0,
+    tell: Callable[[str], None] = lambda what: None,
+) -> LiveWindow:  # fmt: skip
     """Look at a rig for some seconds; nothing moves.
 
     Args:
         config: the robot.
         seconds: length of the window [s].
         lockstep: whether to run in simulated time.
+        seed: of a simulated scene.
         tell: called with what is done.
 
     Raises:
         IbrobotError: if a part of the robot does not start, or dies.
     """
     config = still(config)
-    runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep, source=_Still)))
+    runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep, seed, source=_Still)))
     session = runtime.session
     contract = Contract.from_config(config)
     topics = frozenset(contract.topics)

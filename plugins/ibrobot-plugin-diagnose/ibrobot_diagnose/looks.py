@@ -11,6 +11,8 @@ from ibrobot_diagnose.pictures import Grey, grey
 
 _LEAST = 0.5
 """Share of an area that must count."""
+_FEWEST = 4
+"""Areas from which they count: fewer may be a thing that has moved."""
 _DARK, _WHITE = 12.0, 245.0
 """Grey values between which colours are to be seen."""
 _FLIPS = {
@@ -63,13 +65,16 @@ def looks_of(reference: NDArray[np.uint8], picture: NDArray[np.uint8], weight: G
     rich = rich_areas(one, weight) & used
     sharp, covered = 1.0, 0.0
     if rich.any():
-        details = [np.sqrt((areas_of(_details(each)) ** 2).mean(axis=2))[rich] for each in (one, two)]
-        sharp = float(np.median(details[1]) / max(float(np.median(details[0])), 1e-3) / max(light, 0.05))
-        contrasts = [areas_of(each).std(axis=2)[rich] for each in (one, two)]
+        both = rich & rich_areas(two, weight)  # of what has moved, either picture has a part
+        if both.sum() >= _FEWEST:
+            details = [_deviation(_details(each), weights)[both] for each in (one, two)]
+            sharp = float(np.median(details[1] / np.maximum(details[0], 1e-3)) / max(light, 0.05))
+        contrasts = [_deviation(each, weights)[rich] for each in (one, two)]
         gone = contrasts[1] < 0.3 * contrasts[0] * min(light, 1.0)
         # Out of focus, what is large is still there.
         kept = np.abs(light_now - light * light_then)[rich] < 0.1 * light * light_then[rich] + 3.0
-        covered = float((gone & ~kept).mean())
+        hidden = gone & ~kept
+        covered = float(hidden.mean()) if hidden.sum() >= _FEWEST else 0.0
     every = np.ones_like(weights)
     flip, flipped = _flip(*(_means(each, every).mean(axis=2) for each in (reference, picture)))
     return Looks(light, red, blue, sharp, covered, (plain + 0.03) / (other + 0.03), flip, flipped)
@@ -80,6 +85,14 @@ def _means(picture: NDArray[np.uint8], weights: NDArray[np.float32]) -> NDArray[
     total = weights.sum(axis=2) + 1e-6
     channels = [(areas_of(picture[..., i].astype(np.float32)) * weights).sum(axis=2) / total for i in range(3)]
     return np.stack(channels, axis=2).astype(np.float64)
+
+
+def _deviation(values: Grey, weights: NDArray[np.float32]) -> NDArray[np.float64]:
+    """The deviation of the values in each area, shape (rows, columns)."""
+    areas, total = areas_of(values), weights.sum(axis=2) + 1e-6
+    mean = (areas * weights).sum(axis=2) / total
+    result: NDArray[np.float64] = np.sqrt(((areas - mean[..., None]) ** 2 * weights).sum(axis=2) / total)
+    return result
 
 
 def _colours(means: NDArray[np.float64]) -> NDArray[np.float64]:

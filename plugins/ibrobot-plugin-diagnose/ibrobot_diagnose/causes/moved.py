@@ -117,7 +117,8 @@ def _sight(name: str, now: RigCamera, then: RigCamera, *, same_joints: bool) -> 
             "or give the camera its `transform`"
         )
     weights = [_weight(each, mask=mask) for each in (reference, newest)]
-    looks = looks_of(reference.picture, newest.picture, weights[0] * weights[1])
+    # A camera on the arm sees another part of the scene if the arm stands elsewhere, and its own link in other light.
+    looks = looks_of(reference.picture, newest.picture, weights[0] * weights[1]) if same or stands else None
     sight = attrs.evolve(Sight(*known), moved=moved, unclear=unclear, looks=looks)
     if reference.moving is None or stands is False:
         return sight
