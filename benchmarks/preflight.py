@@ -27,9 +27,10 @@ import attrs
 import numpy as np
 from figures import report
 from ibrobot_diagnose.card import Card, make_card
-from ibrobot_diagnose.live import LiveWindow, look
+from ibrobot_diagnose.live import look
 from ibrobot_diagnose.preflight import Preflight, compared
 from ibrobot_diagnose.rig import Rig, Still
+from ibrobot_diagnose.watch import LiveWindow
 from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 

@@ -59,7 +59,7 @@ SUBSCRIBERS = {
             "ibrobot_kinematics/description.py", "ibrobot_eval/cameras.py", "ibrobot_eval/film.py",
             "ibrobot_gym/environment.py", "ibrobot_mujoco/camera.py", "ibrobot_mujoco/viewer.py",
             "ibrobot_planning/tasks/performing.py", "ibrobot_ros/topics.py", "ibrobot_ros2/inference.py",
-            "ibrobot_diagnose/live.py", "ibrobot_kinematics/tool_pose.py", "ibrobot_web/objects.py",
+            "ibrobot_diagnose/watch.py", "ibrobot_kinematics/tool_pose.py", "ibrobot_web/objects.py",
             "ibrobot_web/viewer.py",
             "ibrobot_mcp/pictures.py",
             "ibrobot_webxr/images.py", "ibrobot_webxr/server.py", "ibrobot_zenoh/shared_topics.py",

@@ -11,9 +11,9 @@ from pathlib import Path
 from ibrobot_provenance.reports import ReportDescriptor
 
 from ibrobot_core.api import Descriptor, Late, hookimpl
-from ibrobot_core.app import Command, Kind
+from ibrobot_core.app import Command, Kind, SectionDescriptor
 from ibrobot_diagnose.cause import ARM_VIEW, DEVICE_POSE, KIND, CauseDescriptor
-from ibrobot_diagnose.options import CHECK_EVENTS, EVENTS, PREFLIGHT_EVENTS, REPORT
+from ibrobot_diagnose.options import CHECK_EVENTS, EVENTS, PREFLIGHT_EVENTS, REPORT, SECTION, PreflightSection
 from ibrobot_diagnose.options import KIND as REPORT_KIND
 
 
@@ -23,6 +23,18 @@ def ibrobot_kinds() -> Iterable[Kind]:
     yield Kind(KIND, "ibrobot_causes", CauseDescriptor)
     yield Kind(ARM_VIEW, "ibrobot_arm_views", Descriptor)
     yield Kind(DEVICE_POSE, "ibrobot_device_poses", Descriptor)
+
+
+@hookimpl
+def ibrobot_sections() -> Iterable[SectionDescriptor]:
+    """What compares the rig of a run with a reference, before it moves."""
+    yield SectionDescriptor(
+        type=SECTION,
+        options=PreflightSection,
+        make=Late("ibrobot_diagnose.section:RigCheck"),
+        without_section=Late("ibrobot_diagnose.section:compares"),
+        summary="compares the rig with a reference before a run moves it",
+    )
 
 
 @hookimpl

@@ -11,6 +11,8 @@ from ibrobot_diagnose.pictures import Grey, grey
 
 _LEAST = 0.5
 """Share of an area that must count."""
+_ALIKE = 0.7
+"""Correlation from which an area shows the same, in focus or not."""
 _FEWEST = 4
 """Areas from which they count: fewer may be a thing that has moved."""
 _DARK, _WHITE = 12.0, 245.0
@@ -31,7 +33,7 @@ class Looks:
     """Red in relation to green; 1 if it is the same."""
     blue: float
     sharp: float
-    """Contrast of the smallest details; falls if the picture is blurred. 1 if it is the same."""
+    """Contrast of the smallest details in relation to all; falls if the picture is blurred. 1 if it is the same."""
     covered: float
     """Share of the areas with something to see in which there is nothing now."""
     swapped: float
@@ -65,10 +67,14 @@ def looks_of(reference: NDArray[np.uint8], picture: NDArray[np.uint8], weight: G
     rich = rich_areas(one, weight) & used
     sharp, covered = 1.0, 0.0
     if rich.any():
-        both = rich & rich_areas(two, weight)  # of what has moved, either picture has a part
+        both = rich & (_correlation(one, two, weights) > _ALIKE)  # what has moved says nothing of the focus
         if both.sum() >= _FEWEST:
-            details = [_deviation(_details(each), weights)[both] for each in (one, two)]
-            sharp = float(np.median(details[1] / np.maximum(details[0], 1e-3)) / max(light, 0.05))
+            # In relation to the contrast of the area, which a lamp changes where it lights only a part of it.
+            sharpness = [
+                _deviation(_details(each), weights)[both] / np.maximum(_deviation(each, weights)[both], 1e-3)
+                for each in (one, two)
+            ]
+            sharp = float(np.median(sharpness[1] / np.maximum(sharpness[0], 1e-3)))
         contrasts = [_deviation(each, weights)[rich] for each in (one, two)]
         gone = contrasts[1] < 0.3 * contrasts[0] * min(light, 1.0)
         # Out of focus, what is large is still there.
@@ -92,6 +98,15 @@ def _deviation(values: Grey, weights: NDArray[np.float32]) -> NDArray[np.float64
     areas, total = areas_of(values), weights.sum(axis=2) + 1e-6
     mean = (areas * weights).sum(axis=2) / total
     result: NDArray[np.float64] = np.sqrt(((areas - mean[..., None]) ** 2 * weights).sum(axis=2) / total)
+    return result
+
+
+def _correlation(one: Grey, other: Grey, weights: NDArray[np.float32]) -> NDArray[np.float64]:
+    """The correlation of two pictures in each area, shape (rows, columns)."""
+    total = weights.sum(axis=2) + 1e-6
+    a, b = (each - ((each * weights).sum(axis=2) / total)[..., None] for each in (areas_of(one), areas_of(other)))
+    norm = np.sqrt((a * a * weights).sum(axis=2) * (b * b * weights).sum(axis=2)) + 1e-6
+    result: NDArray[np.float64] = (a * b * weights).sum(axis=2) / norm
     return result
 
 

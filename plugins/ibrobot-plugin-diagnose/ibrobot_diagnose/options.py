@@ -8,7 +8,7 @@ from typing import override
 import attrs
 from ibrobot_provenance.work_options import on_option
 
-from ibrobot_core.api import option
+from ibrobot_core.api import documented, option
 from ibrobot_core.app import Event, Shown
 
 KIND = "explanation"
@@ -128,6 +128,27 @@ class CheckReport(Event):
 CHECK_EVENTS = (CheckProgress, CheckReport)
 
 
+SECTION = "preflight"
+"""The section of the robot YAML."""
+
+
+@documented
+@attrs.frozen
+class PreflightSection:
+    """Options of the section `preflight`."""
+
+    against: Path | None = option(
+        None, help="the reference; none: that of the recording's dataset, or of the mode's checkpoint"
+    )
+    action: str = option(
+        "warn",
+        choices=("warn", "refuse", "off"),
+        help="what a difference does: warn logs it; refuse ends the run before anything moves if a line fails; off "
+        "compares nothing",
+    )
+    seconds: float = option(1.0, unit="s", ge=0.5, le=10, help="length of the window")
+
+
 @attrs.frozen(kw_only=True)
 class PreflightOptions:
     """Which rig is looked at, and what it is compared with."""
@@ -140,7 +161,7 @@ class PreflightOptions:
     take: Path | None = option(None, typed="--take FILE", label="Take", help="write a reference to this file")
     sim: bool = option(False, label="Simulated", help="use the simulation section instead of hardware")
     mode: str | None = option(None, typed="--mode MODE", label=None, help="in place of default_control_mode")
-    seconds: float = option(3.0, ge=0.5, le=60, unit="s", label="Duration", more=True, help="length of the window")
+    seconds: float = option(3.0, ge=0.5, le=10, unit="s", label="Duration", more=True, help="length of the window")
     lockstep: bool = option(False, label=None, help="look in simulated time; the loop's rate is then not measured")
     overrides: tuple[str, ...] = option((), typed="--set PATH=VALUE", label=None, help="e.g. control.rate_hz=50")
     out: Path | None = option(None, label="Folder", help="folder for a report as HTML and JSON")

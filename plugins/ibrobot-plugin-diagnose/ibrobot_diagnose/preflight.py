@@ -13,8 +13,8 @@ from ibrobot_core.app import RobotConfig
 from ibrobot_diagnose.arm_view import with_moving
 from ibrobot_diagnose.card import Card
 from ibrobot_diagnose.cause import Diagnosis, Finding, Reference, Verdict, diagnose
-from ibrobot_diagnose.live import LiveWindow
 from ibrobot_diagnose.report import finding_facts
+from ibrobot_diagnose.watch import LiveWindow
 from ibrobot_diagnose.window import Window
 
 _WORDS: Mapping[Verdict, str] = {"ok": "ok  ", "warn": "warn", "fail": "FAIL", "cannot tell": "?   "}

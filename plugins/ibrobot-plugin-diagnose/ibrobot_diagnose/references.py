@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from ibrobot_diagnose.card import Card
     from ibrobot_diagnose.window import Window
 
+RIG = "rig.json"
+"""Name of the reference of a rig in the folder of a dataset."""
 _INFO = Path("meta") / "info.json"
 _NO_ANGLE = 10.0
 """Positions beyond it are no radians."""
@@ -164,3 +166,21 @@ def card_of(path: Path) -> Card:
     if (stored := with_card(folders)) is not None:
         return Card.read(stored)
     return make_card(windows_of(path))
+
+
+def reference_of(path: Path) -> Card:
+    """What a rig is compared with: a reference that was taken, that of a dataset or checkpoint, or the card of data.
+
+    Raises:
+        DatasetError: as `card_of`, if it is not there, or its card says nothing of a rig.
+    """
+    if not path.exists():
+        raise DatasetError(f"{path}: there is no such reference, dataset or checkpoint")
+    taken = path / RIG
+    card = card_of(taken if taken.is_file() else path)
+    if card.rig is None:
+        raise DatasetError(
+            f"{path}: its card is from before preflight, and says nothing of the rig; make it again (`ibrobot datasets "
+            "card`), or take a reference (`ibrobot preflight ROBOT --take FILE`)"
+        )
+    return card

@@ -18,7 +18,7 @@ from ibrobot_core.app import (
     wrong_input,
 )
 from ibrobot_diagnose.options import Looking, PreflightOptions, PreflightReport
-from ibrobot_diagnose.references import card_of
+from ibrobot_diagnose.references import reference_of
 
 if TYPE_CHECKING:
     from ibrobot_diagnose.card import Card
@@ -46,12 +46,7 @@ class Preflight(PreflightOptions):
         config = load_config(
             find_config(self.robot, installed_plugins()), overrides=self.overrides, mode=self.mode, sim=self.sim
         )
-        card = card_of(self.against) if self.against is not None else None
-        if card is not None and card.rig is None:
-            raise RequestError(
-                f"--against {self.against}: its card is from before preflight, and says nothing of the rig; make it "
-                "again (`ibrobot datasets card`), or take a reference (`--take FILE`)"
-            )
+        card = reference_of(self.against) if self.against is not None else None
         facts = _looked(self, config, card, emit)
         if emit is not None:
             emit(
