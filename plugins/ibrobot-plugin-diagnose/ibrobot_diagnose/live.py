@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import override
 
 import attrs
-from ibrobot_calibration.joint_units import calibrations
 
 from ibrobot_core.api import HardwareError, IbrobotError, ns
 from ibrobot_core.app import (

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import override
 
 import attrs
+from ibrobot_calibration.joint_units import calibrations
 
 import ibrobot_core
 from ibrobot_core.api import (
@@ -23,7 +24,7 @@ from ibrobot_core.api import (
     RecorderError,
     TopicSummary,
 )
-from ibrobot_core.app import Received, RunView, calibrations, installed_plugins
+from ibrobot_core.app import Received, RunView, installed_plugins
 from ibrobot_diagnose.rig import Rig, rig_of
 from ibrobot_diagnose.window import Window, read_window
 
