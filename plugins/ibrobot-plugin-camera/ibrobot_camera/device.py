@@ -14,6 +14,7 @@ from ibrobot_camera.options import OpenCvOptions, RealSenseOptions
 from ibrobot_core.api import MissingDependency, SensorError
 
 BY_ID = Path("/dev/v4l/by-id")
+BY_PATH = Path("/dev/v4l/by-path")
 LIST = "`ibrobot camera list` shows the available ones"
 NO_DEVICE = "there is no such device"
 _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
@@ -48,15 +49,24 @@ def find_device(device: int | str) -> Device:
         return Device("stream", text)
     if text.isdigit():
         return Device("v4l2", f"/dev/video{text}")
-    if "/" not in text and (BY_ID / text).exists():
-        return Device("v4l2", str(BY_ID / text))
+    for folder in (BY_ID, BY_PATH):
+        if "/" not in text and (folder / text).exists():
+            return Device("v4l2", str(folder / text))
     path = Path(text).expanduser()
     if text.startswith("/dev/"):
         return Device("v4l2", text)
     if path.is_file():
         return Device("file", str(path))
-    there = ", ".join(sorted(entry.name for entry in BY_ID.iterdir())) if BY_ID.is_dir() else "none"
-    raise SensorError(f"no file, URL or device {text!r}; devices under {BY_ID}: {there}")
+    raise SensorError(f"no file, URL or device {text!r}; {_stable()}")
+
+
+def _stable() -> str:
+    """The names of the cameras that are there, which stay the same, for messages."""
+    known = []
+    for folder in (BY_ID, BY_PATH):
+        there = ", ".join(sorted(entry.name for entry in folder.iterdir())) if folder.is_dir() else "none"
+        known.append(f"devices under {folder}: {there}")
+    return "; ".join(known)
 
 
 def video_device(options: OpenCvOptions) -> Mapping[str, str]:

@@ -21,7 +21,9 @@ JPEG_QUALITY = option(90, ge=1, le=100, help="JPEG quality of images that the ca
 class OpenCvOptions:
     """Options of `type: opencv`: a V4L2 device, a network stream, or a video file."""
 
-    device: int | str = option(help="a number, /dev/video0, a stable name under /dev/v4l/by-id, a URL, or a video file")
+    device: int | str = option(
+        help="a number, /dev/video0, a stable name under /dev/v4l/by-id or by-path, a URL, or a file"
+    )
     width: int | None = option(None, unit="px", gt=0, help="image width; None: the source's")
     height: int | None = option(None, unit="px", gt=0, help="image height; None: the source's")
     fps: float | None = option(None, unit="Hz", gt=0, le=1000, help="images per second; None: the source's")

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import attrs
 
-from ibrobot_camera.device import BY_ID
+from ibrobot_camera.device import BY_ID, BY_PATH
 
 _QUERYCAP, _ENUM_FMT, _ENUM_FRAMESIZES, _ENUM_FRAMEINTERVALS = 0x80685600, 0xC0405602, 0xC02C564A, 0xC034564B
 _CAPTURE = 1
@@ -56,11 +56,16 @@ class Camera:
     modes: tuple[Mode, ...]
     problem: str = ""
     """Why its modes could not be read."""
+    usb_path: str = ""
+    """The name of its USB port under /dev/v4l/by-path, which tells equal cameras apart; empty if it has none."""
 
 
 def cameras() -> list[Camera]:
     """The capture devices of this machine."""
-    ids = {str(entry.resolve()): entry.name for entry in sorted(BY_ID.iterdir())} if BY_ID.is_dir() else {}
+    ids, paths = (
+        {str(entry.resolve()): entry.name for entry in sorted(folder.iterdir())} if folder.is_dir() else {}
+        for folder in (BY_ID, BY_PATH)
+    )
     connected = []
     for path in sorted(Path("/dev").glob("video*"), key=lambda p: (len(p.name), p.name)):
         try:
@@ -69,9 +74,10 @@ def cameras() -> list[Camera]:
                 if not struct.unpack_from("<I", capability, 88)[0] & _CAPTURE:
                     continue
                 card = capability[16:48].split(b"\0")[0].decode(errors="replace")
-                connected.append(Camera(str(path), card, ids.get(str(path), ""), tuple(_modes(device))))
+                camera = Camera(str(path), card, ids.get(str(path), ""), tuple(_modes(device)))
         except OSError as error:
-            connected.append(Camera(str(path), "", ids.get(str(path), ""), (), error.strerror or str(error)))
+            camera = Camera(str(path), "", ids.get(str(path), ""), (), error.strerror or str(error))
+        connected.append(attrs.evolve(camera, usb_path=paths.get(str(path), "")))
     return connected
 
 

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from ibrobot_camera import capture as capture_module
+from ibrobot_camera import device as device_module
 from ibrobot_camera import ibrobot_sensors
 from ibrobot_camera.camera import OpenCvCamera, to_image
 from ibrobot_camera.capture import Capture
@@ -343,6 +344,18 @@ class TestDevices:
         (tmp_path / "no.mp4").write_text("no video")
         with pytest.raises(SensorError, match="is not a video that can be decoded"):
             camera(host_context("top"), str(tmp_path / "no.mp4")).open()
+
+    def test_a_name_that_stays_is_found_by_device_or_by_usb_port(self, tmp_path, monkeypatch):
+        """Equal cameras without serial numbers have one name by id, but each its own by its port."""
+        for folder, name in (("by-id", "usb-HD_Cam"), ("by-path", "pci-usb-0:2")):
+            (tmp_path / folder).mkdir()
+            (tmp_path / folder / name).touch()
+        monkeypatch.setattr(device_module, "BY_ID", tmp_path / "by-id")
+        monkeypatch.setattr(device_module, "BY_PATH", tmp_path / "by-path")
+        assert find_device("usb-HD_Cam") == Device("v4l2", str(tmp_path / "by-id" / "usb-HD_Cam"))
+        assert find_device("pci-usb-0:2") == Device("v4l2", str(tmp_path / "by-path" / "pci-usb-0:2"))
+        with pytest.raises(SensorError, match=r"by-id: usb-HD_Cam; devices under .*by-path: pci-usb-0:2"):
+            find_device("pci-usb-0:9")
 
     @pytest.mark.parametrize(
         ("device", "message"),

@@ -40,12 +40,20 @@ def test_list_without_cameras_says_what_to_look_at(monkeypatch: pytest.MonkeyPat
 def test_list_shows_stable_ids_and_modes(monkeypatch: pytest.MonkeyPatch) -> None:
     modes = (v4l2.Mode("MJPG", 640, 480, (30.0, 15.0)),)
     found = [
-        v4l2.Camera("/dev/video0", "HD Cam", "usb-HD_Cam-video-index0", modes),
+        v4l2.Camera("/dev/video0", "HD Cam", "usb-HD_Cam-video-index0", modes, usb_path="pci-usb-0:2:1.0-video-index0"),
         v4l2.Camera("/dev/video2", "", "", (), "Permission denied"),
     ]
     monkeypatch.setattr(v4l2, "cameras", lambda: found)
     output = CliRunner().invoke(camera, ["list"]).output
-    for text in ("/dev/video0  HD Cam", "usb-HD_Cam-video-index0", "MJPG", "640x480", "30, 15", "Permission denied"):
+    for text in (
+        "/dev/video0  HD Cam",
+        "usb-HD_Cam-video-index0",
+        "port: pci-usb-0:2",
+        "MJPG",
+        "640x480",
+        "30, 15",
+        "Permission denied",
+    ):
         assert text in output
 
 

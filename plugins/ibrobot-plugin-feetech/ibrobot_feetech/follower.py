@@ -33,12 +33,13 @@ from ibrobot_feetech.arm import Arm, Tuning
 from ibrobot_feetech.bus import RETURN_DELAY_S, FeetechBus
 from ibrobot_feetech.errors import FeetechError, NoReply, Place, PortError, ServoFault, TorqueStaysOn
 from ibrobot_feetech.health import Health, Measured, SteadyLoad
+from ibrobot_feetech.opening import open_port
 from ibrobot_feetech.options import TOOL, FollowerOptions, check_follower
 from ibrobot_feetech.port import emulate
 from ibrobot_feetech.protocol import OVER_CURRENT, OVERLOAD, faults
 from ibrobot_feetech.supply import supply
 from ibrobot_feetech.sync import Replies, SyncReader, SyncWriter
-from ibrobot_feetech.usb import check_adapter
+from ibrobot_feetech.usb import BY_SERIAL, check_adapter
 
 _RADIANS_PER_TICK = 2 * np.pi / 4096
 _SLACK_TICKS = 16
@@ -79,7 +80,7 @@ class FeetechFollower(Hardware):
         try:
             calibration = load_calibration(options.calibration, ctx.joints, tool=TOOL)
         except IbrobotError as error:
-            if options.port.startswith("/dev/") or calibration_path(options.calibration).exists():
+            if options.port.startswith(("/dev/", BY_SERIAL)) or calibration_path(options.calibration).exists():
                 raise
             known = "its emulator has no calibration" if Path(options.port).exists() else "there is no such port"
             command = emulate(options.port, options.calibration)
@@ -113,7 +114,7 @@ class FeetechFollower(Hardware):
     def connect(self) -> None:
         bus, arm = self._bus, self._arm
         self._fault = HardwareError(f"{self._ctx.name}: not connected")
-        bus.open()
+        open_port(bus, arm.calibration)
         bus.return_delay_s = RETURN_DELAY_S
         self._relaxed = False
         try:
@@ -202,7 +203,7 @@ class FeetechFollower(Hardware):
         bus, arm = self._bus, self._arm
         if isinstance(fault, PortError) or not bus.is_open:
             bus.close()
-            bus.open()
+            open_port(bus, arm.calibration)
             check_adapter(arm.calibration, self._options.port)
         bus.return_delay_s = RETURN_DELAY_S
         bus.resynchronise()

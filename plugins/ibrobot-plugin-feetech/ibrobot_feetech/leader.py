@@ -27,6 +27,7 @@ from ibrobot_core.api import (
 from ibrobot_feetech.arm import Arm, calibration_differences, find_servos, hold, relax
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.errors import FeetechError
+from ibrobot_feetech.opening import open_port
 from ibrobot_feetech.options import TOOL, LeaderOptions
 from ibrobot_feetech.sync import SyncReader
 from ibrobot_feetech.ticks import TICKS_PER_RADIAN, TICKS_PER_TURN
@@ -109,7 +110,7 @@ class LeaderTeleop(Teleop):
         port, baud_rate, retries = self._options.port, self._options.baud_rate, self._options.retries
         bus = FeetechBus(port, baud_rate=baud_rate, joints=self._arm.names, retries=retries)
         try:
-            bus.open()
+            open_port(bus, self._arm.calibration)
             check_adapter(self._arm.calibration, port)
             self._prepare(bus)
         except HardwareError as error:

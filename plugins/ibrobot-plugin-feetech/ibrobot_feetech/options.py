@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import attrs
 
-from ibrobot_core.api import OptionFault, did_you_mean, documented, not_empty, option
+from ibrobot_core.api import HardwareError, OptionFault, did_you_mean, documented, not_empty, option
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
@@ -25,7 +25,9 @@ class FollowerOptions:
     """Options of `type: feetech_so101`: an arm whose joints are STS3215 servos on one bus."""
 
     port: str = option(
-        validator=not_empty, help="serial port, e.g. /dev/ttyACM0; a path under /dev/serial/by-id does not change"
+        validator=not_empty,
+        help="serial port, e.g. /dev/ttyACM0, which may change; a path under /dev/serial/by-id does not, nor does "
+        "serial:NUMBER, the USB serial number of its adapter",
     )
     calibration: str = option(help="name or path of a calibration, which ibrobot feetech calibrate creates")
     baud_rate: int = option(1_000_000, unit="baud", gt=0, help="baud rate of the bus")
@@ -83,7 +85,9 @@ class LeaderOptions:
     """Options of `type: so101_leader`: an arm with STS3215 servos that is moved by hand."""
 
     port: str = option(
-        validator=not_empty, help="serial port, e.g. /dev/ttyACM1; a path under /dev/serial/by-id does not change"
+        validator=not_empty,
+        help="serial port, e.g. /dev/ttyACM1, which may change; a path under /dev/serial/by-id does not, nor does "
+        "serial:NUMBER, the USB serial number of its adapter",
     )
     calibration: str = option(help="name or path of a calibration, which ibrobot feetech calibrate creates")
     baud_rate: int = option(1_000_000, unit="baud", gt=0, help="baud rate of the bus")
@@ -182,4 +186,9 @@ def _unknown(option: str, names: Sequence[str], known: Sequence[str], what: str)
 
 def serial_port(options: FollowerOptions | LeaderOptions) -> Mapping[str, str]:
     """The resolved path of the port."""
-    return {"port": os.path.realpath(options.port)}
+    from ibrobot_feetech.usb import find_port
+
+    try:
+        return {"port": os.path.realpath(find_port(options.port))}
+    except HardwareError:  # it is not plugged in
+        return {"port": options.port}

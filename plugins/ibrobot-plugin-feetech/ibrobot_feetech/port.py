@@ -12,7 +12,9 @@ from contextlib import suppress
 
 import serial
 
+from ibrobot_core.api import HardwareError
 from ibrobot_feetech.errors import Place, PortError, PortForbidden, PortHeld
+from ibrobot_feetech.usb import BY_SERIAL, find_port
 
 _GONE = (errno.EIO, errno.ENODEV, errno.ENXIO, errno.EBADF)
 _VMIN = 6
@@ -28,7 +30,7 @@ _MOST_AWAITED = 255
 def no_such_port(path: str) -> str:
     """What to say of a port that does not exist; one outside /dev is that of an emulator."""
     known = "there is no such port"
-    return known if path.startswith("/dev/") else f"{known}; for an emulated arm run {emulate(path)}"
+    return known if path.startswith(("/dev/", BY_SERIAL)) else f"{known}; for an emulated arm run {emulate(path)}"
 
 
 def emulate(path: str, calibration: str | None = None) -> str:
@@ -45,7 +47,7 @@ class SerialPort:
     takes one wake-up per exchange instead of one per packet.
 
     Args:
-        path: e.g. `/dev/ttyACM0`.
+        path: e.g. `/dev/ttyACM0`, or `serial:` with the USB serial number of its adapter.
         baud_rate: [baud].
     """
 
@@ -72,7 +74,11 @@ class SerialPort:
         if self._serial is not None:
             return
         try:
-            self._serial = serial.Serial(self.path, self.baud_rate, timeout=0, write_timeout=None, exclusive=True)
+            path = find_port(self.path)
+        except HardwareError as error:
+            raise PortError(Place(self.path), str(error)) from None
+        try:
+            self._serial = serial.Serial(path, self.baud_rate, timeout=0, write_timeout=None, exclusive=True)
         except (OSError, ValueError, termios.error) as error:
             raise _why_closed(Place(self.path), error) from None
         # Drivers without this flag are already fast, or cannot be made faster.

@@ -14,6 +14,9 @@ from ibrobot_core.api import HardwareError
 ADAPTER_VENDOR = 0x1A86
 """USB vendor id of the CH340 and CH343 on the SO-101's boards."""
 _BY_ID = Path("/dev/serial/by-id")
+BY_SERIAL = "serial:"
+"""What a port begins with that names its adapter by the USB serial number."""
+GIVE = "give that port, or `port: serial:{}`, which finds it wherever it is"
 
 
 @attrs.frozen
@@ -56,9 +59,35 @@ def usb_ports() -> list[UsbPort]:
     ]
 
 
+def find_port(port: str) -> str:
+    """The path of a port in a robot YAML: a path, or `serial:` with the USB serial number of the adapter.
+
+    Raises:
+        HardwareError: if no adapter has this serial number; names those that are plugged in.
+    """
+    if not port.startswith(BY_SERIAL):
+        return port
+    there = usb_ports()
+    for each in there:
+        if each.serial_number == port.removeprefix(BY_SERIAL):
+            return each.stable or each.path
+    known = ", ".join(f"{BY_SERIAL}{each.serial_number} at {each.path}" for each in there if each.serial_number)
+    raise HardwareError(f"no USB adapter with this serial number is plugged in; there is {known or 'none with one'}")
+
+
+def adapter_elsewhere(calibration: Calibration) -> UsbPort | None:
+    """Where the adapter is with which a calibration was made; None if it is unknown, or not plugged in."""
+    if not calibration.adapter:
+        return None
+    return next((each for each in usb_ports() if each.serial_number == calibration.adapter), None)
+
+
 def usb_port(path: str) -> UsbPort | None:
     """The USB port at a path or symbolic link; None if it is not a USB port."""
-    real = str(Path(path).resolve())
+    try:
+        real = str(Path(find_port(path)).resolve())
+    except HardwareError:
+        return None
     return next((each for each in usb_ports() if each.path == real), None)
 
 
@@ -74,8 +103,10 @@ def check_adapter(calibration: Calibration, port: str) -> None:
     there = (
         f"has the USB serial number {adapter.serial_number}" if adapter.serial_number else "has no USB serial number"
     )
-    elsewhere = next((each for each in usb_ports() if each.serial_number == calibration.adapter), None)
-    where = f", which is at {elsewhere.stable or elsewhere.path}: give that port" if elsewhere else ""
+    elsewhere = adapter_elsewhere(calibration)
+    where = ""
+    if elsewhere is not None:
+        where = f", which is at {elsewhere.stable or elsewhere.path}: {GIVE.format(calibration.adapter)}"
     raise HardwareError(
         f"{port}: this is another arm: its adapter {there}, {calibration.path} was made with "
         f"{calibration.adapter}{where}; are the ports of leader and follower swapped? If the adapter was replaced, "

@@ -18,7 +18,7 @@ from ibrobot_feetech.emulator import Emulator
 from ibrobot_feetech.errors import PortError, PortForbidden, PortHeld
 from ibrobot_feetech.follower import FeetechFollower
 from ibrobot_feetech.leader import LeaderTeleop
-from ibrobot_feetech.options import FollowerOptions, LeaderOptions
+from ibrobot_feetech.options import FollowerOptions, LeaderOptions, serial_port
 from ibrobot_feetech.port import SerialPort
 from ibrobot_testing.command import command_line
 from ibrobot_testing.contexts import control_context, host_context
@@ -119,6 +119,47 @@ class TestAdapter:
         arm = follower(emulator.port, file)
         arm.connect()
         arm.disconnect()
+
+
+class TestRenumberedPorts:
+    """After a reboot the adapters may have each other's number, or new ones."""
+
+    @pytest.mark.usefixtures("ports")
+    def test_an_arm_is_found_by_the_serial_number_of_its_adapter(self, file: Path, monkeypatch: pytest.MonkeyPatch):
+        named = FollowerOptions("serial:FOLLOWER", str(file))
+        with Emulator(6) as emulator:
+            prepare(emulator, arm_calibration())
+            plug_in(monkeypatch, {"/dev/ttyACM0": "LEADER", emulator.port: "FOLLOWER"})
+            assert serial_port(named) == {"port": os.path.realpath(emulator.port)}
+            arm = follower("serial:FOLLOWER", file)
+            arm.connect()
+            arm.disconnect()
+            leader = LeaderTeleop(LeaderOptions("serial:FOLLOWER", str(file), deadman="none"), host_context("leader"))
+            leader.connect()
+            leader.disconnect()
+
+    def test_an_adapter_that_is_absent_is_named_and_so_are_the_others(
+        self, file: Path, monkeypatch: pytest.MonkeyPatch
+    ):
+        plug_in(monkeypatch, {"/dev/ttyACM0": "LEADER", "/dev/ttyACM1": None})
+        with pytest.raises(PortError, match=r"no USB adapter with this .* there is serial:LEADER at /dev/ttyACM0;"):
+            follower("serial:FOLLOWER", file).connect()
+        assert serial_port(FollowerOptions("serial:FOLLOWER", str(file))) == {"port": "serial:FOLLOWER"}
+        plug_in(monkeypatch, {})
+        with pytest.raises(PortError, match=r"there is none with one"):
+            SerialPort("serial:FOLLOWER", 1_000_000).open()
+
+    def test_a_port_that_is_gone_says_where_its_arm_is(
+        self, emulator: Emulator, file: Path, monkeypatch: pytest.MonkeyPatch
+    ):
+        plug_in(monkeypatch, {emulator.port: "FOLLOWER"})
+        with pytest.raises(PortError) as refused:
+            follower("/dev/ttyACM9", file).connect()
+        for words in ("/dev/ttyACM9: there is no such port", "follower.json is at ", "`port: serial:FOLLOWER`"):
+            assert words in str(refused.value)
+        plug_in(monkeypatch, {"/dev/ttyACM3": "LEADER"})
+        with pytest.raises(PortError, match=r"there is no such port; check"):
+            follower("/dev/ttyACM9", file).connect()
 
 
 class TestSupply:

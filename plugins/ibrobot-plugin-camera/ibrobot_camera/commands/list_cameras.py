@@ -13,7 +13,7 @@ from ibrobot_core.app import Screen, echo, styled
 class ListCameras:
     """List the cameras of this machine.
 
-    It shows path, stable id, name, and formats, sizes and rates of each.
+    It shows path, stable id, USB port, name, and formats, sizes and rates of each.
     """
 
     def __call__(self) -> list[v4l2.Camera]:
@@ -29,6 +29,8 @@ class ListCameras:
             console.print(styled(camera.path, "bold") + styled(f"  {camera.name}"))
             if camera.stable_id:
                 console.print(f"  device: {camera.stable_id}", soft_wrap=True)
+            if camera.usb_path:
+                console.print(f"  device, by its USB port: {camera.usb_path}", soft_wrap=True)
             if camera.problem:
                 console.print(
                     styled(f"  {camera.problem}", "red") + styled(": sudo usermod -aG video $USER, log in again")
