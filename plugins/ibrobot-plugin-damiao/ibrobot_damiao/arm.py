@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
 from typing import override
 
@@ -28,6 +27,8 @@ from ibrobot_damiao.protocol import CLEAR_ERROR, ENABLE, ERRORS, MIT, MODE, ON, 
 
 _ANSWERS = 0.4
 """Fraction of a tick within which motors must answer."""
+_END = 1.5 / 65535
+"""Fraction of a range, at its ends, in which a motor reports positions beyond it."""
 _MARGIN = 2.0
 """How far a temperature must fall below its level to end a condition [deg C]."""
 _QUANTITIES = {0x8: "voltage", 0x9: "voltage", 0xA: "current", 0xD: "communication", 0xE: "load"}
@@ -63,6 +64,9 @@ class DamiaoArm(Hardware):
         self._ids = tuple(motor.id for motor in motors)
         self._sign: Vector = np.array([-1.0 if motor.inverted else 1.0 for motor in motors])
         self._zero: Vector = np.array([motor.zero for motor in motors])
+        columns = ctx.robot.indices(ctx.joints)
+        limits = np.stack([ctx.robot.lower[columns], ctx.robot.upper[columns]])
+        self._limits = self._sign * (limits - self._zero)  # as positions of the motors
         self._gains = [(motor.kp, motor.kd) for motor in motors]
         channel = Channel(options.channel, options.interface, options.bitrate, options.data_bitrate)
         self._bus = DamiaoBus(channel, dict(zip(self._ids, ctx.joints, strict=True)), options.retries)
@@ -114,10 +118,9 @@ class DamiaoArm(Hardware):
                 self._lost_replies += 1
         if (gone := np.flatnonzero(self._lost > self._options.lost_replies)).size:
             others = f", nor do {', '.join(self.joints[i] for i in gone[1:])}" if len(gone) > 1 else ""
-            self._fault = NoAnswer(
-                f"{self._place(int(gone[0]))}: does not answer for {self._options.lost_replies + 1} ticks{others}; "
-                "check its power and its cable"
-            )
+            when = f" for {self._options.lost_replies + 1} ticks{others}"
+            first = int(gone[0])
+            self._fault = NoAnswer(f"{self._place(first)}: {self._bus.silence(self._ids[first], when)}")
             raise self._fault
         self._conditions = tuple(self._examine())
         last = self._last
@@ -160,7 +163,7 @@ class DamiaoArm(Hardware):
         if not self._holding:
             return None
         ids = "".join(f" --id {motor}" for motor in self._ids)
-        return Holding(self._options.channel, f"ibrobot damiao off {shlex.quote(self._options.channel)}{ids}")
+        return Holding(self._options.channel, f"ibrobot damiao off {self._bus.channel.arguments}{ids}")
 
     @override
     def health(self) -> Sequence[Condition]:
@@ -220,7 +223,13 @@ class DamiaoArm(Hardware):
                 missing.append(motor)
                 last = error
                 continue
+            self._check_range(self._ids.index(motor))
             if self._bus.read(motor, MODE) != MIT:
+                if self._bus.ask(motor).state == ON:
+                    raise HardwareError(
+                        f"{self._bus.place(motor)}: its torque is on in another mode than MIT mode, and a change could "
+                        f"move it; hold the arm, and `ibrobot damiao off {self._bus.channel.arguments} --id {motor}`"
+                    )
                 self._bus.write(motor, MODE, MIT)
         if len(missing) > 1:
             names = ", ".join(f"{motor} ({self.joints[self._ids.index(motor)]})" for motor in missing)
@@ -228,16 +237,44 @@ class DamiaoArm(Hardware):
         if missing:
             raise last
 
+    def _check_range(self, index: int) -> None:
+        """Check that a motor's frames reach to the limits of its joint; beyond, it would stop in silence.
+
+        Raises:
+            HardwareError: if they do not.
+        """
+        end = self._bus.motors[self._ids[index]].ranges.position
+        reach = self._limits[:, index]
+        if np.abs(reach).max() > end:
+            raise HardwareError(
+                f"{self._place(index)}: the joint's lower and upper are {reach.min():g} and {reach.max():g} rad of the "
+                f"motor, beyond its range of {end:g} rad either way (register PMAX); narrow the limits, correct "
+                "`zero`, or raise PMAX with the motor's software"
+            )
+
+    def _beyond(self, index: int, feedback: Feedback) -> str:
+        """Why the position in a feedback is not that of the motor; empty if it is."""
+        end = self._bus.motors[self._ids[index]].ranges.position
+        if abs(feedback.position) < end * (1 - _END):
+            return ""
+        return (
+            f"{self._place(index)}: is at or beyond the end of its range of {end:g} rad either way (register PMAX), so "
+            "its position is unknown; take its torque off, turn the joint back by hand, or set its zero with "
+            "`ibrobot damiao zero`"
+        )
+
     def _hold(self, index: int) -> None:
         """Switch a motor's torque on, where it is, so that the joint does not jump.
 
         Raises:
-            HardwareError: if the motor reports an error or does not switch its torque on.
+            HardwareError: if the motor reports an error, does not switch its torque on, or is beyond its range.
         """
         motor, (kp, kd) = self._ids[index], self._gains[index]
         feedback = self._bus.ask(motor)
         if feedback.state in ERRORS:
             feedback = self._bus.ask(motor, command(CLEAR_ERROR))
+        if reason := self._beyond(index, feedback):
+            raise HardwareError(reason)
         # A motor goes on with the last command it had, so it gets the new one before its torque.
         here = MitCommand(feedback.position, kp, kd).encode(self._bus.motors[motor].ranges)
         self._bus.ask(motor, here)
@@ -282,6 +319,8 @@ class DamiaoArm(Hardware):
                     "motor's cable; a reset switches it on"
                 )
                 conditions.append(Condition(joint, "torque", 0.0, "", Severity.FAULT, message))
+            if reason := self._beyond(index, feedback):
+                conditions.append(Condition(joint, "position", feedback.position, "rad", Severity.FAULT, reason))
             if (hot := self._temperature(index, max(feedback.coil, feedback.driver))) is not None:
                 conditions.append(hot)
         return conditions

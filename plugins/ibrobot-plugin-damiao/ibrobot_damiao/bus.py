@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -14,6 +15,7 @@ from serial import SerialException
 
 from ibrobot_core.api import HardwareError
 from ibrobot_damiao.protocol import (
+    DEFAULT_BITRATE,
     DISABLE,
     ERRORS,
     FEEDBACK_ID,
@@ -44,6 +46,12 @@ _SOCKET_S = 0.0003
 """How long a frame that has arrived takes to be read from a socket [s], of which pyserial reads one byte at a time."""
 _DRAIN = 4096
 """Most frames that are thrown away at once: on a bus that someone floods, emptying the queue would never end."""
+_LATE = 64
+"""Most frames that are read after the time for an answer is over: the answer may be queued behind those of others."""
+_MOST = Ranges(200.0, 1000.0, 1000.0)
+"""Widest plausible ranges: a frame has steps of 1/65535 of a position's range, and of 1/4095 of the others."""
+_LEAST = 0.1
+"""Narrowest plausible range."""
 
 
 class BusError(HardwareError):
@@ -66,7 +74,7 @@ class Channel:
     """A network interface, e.g. `can0`; or a serial port, or `socket://HOST:PORT`, of an adapter that speaks slcan."""
     interface: str = ""
     """Interface type of python-can; empty: `slcan` for ports and sockets, else `socketcan`."""
-    bitrate: int = 1_000_000
+    bitrate: int = DEFAULT_BITRATE
     """[bit/s]; on socketcan `ip link` sets it."""
     data_bitrate: int | None = None
     """Rate of the data in CAN FD frames [bit/s]; None: classic frames."""
@@ -75,6 +83,14 @@ class Channel:
     def kind(self) -> str:
         """Interface type of python-can."""
         return self.interface or ("slcan" if "/" in self.name else "socketcan")
+
+    @property
+    def arguments(self) -> str:
+        """Arguments of `ibrobot damiao` commands for it, quoted for a shell."""
+        more = f" --interface {shlex.quote(self.interface)}" if self.interface else ""
+        more += f" --bitrate {self.bitrate}" if self.bitrate != DEFAULT_BITRATE else ""
+        more += f" --data-bitrate {self.data_bitrate}" if self.data_bitrate is not None else ""
+        return shlex.quote(self.name) + more
 
     @property
     def remedy(self) -> str:
@@ -112,6 +128,8 @@ class DamiaoBus:
         self._bus: can.BusABC | None = None
         self.motors: dict[int, Motor] = {}
         """Motors that `find` has found, by id."""
+        self._strange: dict[int, str] = {}
+        """Motor -> why its last feedback cannot be used."""
         self.counters = {"error_frames": 0, "strange_frames": 0}
 
     @property
@@ -140,7 +158,8 @@ class DamiaoBus:
             self._bus = can.Bus(channel.name, interface=channel.kind, bitrate=channel.bitrate, **more)
         except can.CanInterfaceNotImplementedError as error:
             raise BusError(f"{self.place()}: {error}; interface types: {', '.join(can.interfaces.BACKENDS)}") from None
-        except (can.CanError, SerialException, OSError, ValueError) as error:
+        except (can.CanError, SerialException, OSError, ValueError, TypeError, ImportError, NameError) as error:
+            # the latter three: a type that lacks its library, or needs more than a channel
             raise BusError(f"{self.place()}: cannot be opened: {error}; {channel.remedy}") from error
 
     def close(self) -> None:
@@ -169,25 +188,33 @@ class DamiaoBus:
         if not answers:
             raise NoAnswer(
                 f"{self.place(motor)}: does not answer; check its power, its cable, and with `ibrobot damiao scan "
-                f"{self.channel.name}` its id"
+                f"{self.channel.arguments}` its id"
             )
         if len(answers) > 1:
             raise HardwareError(
                 f"{self.place(motor)}: {len(answers)} motors have this id; connect one at a time, and give each an id "
-                f"of its own with `ibrobot damiao set-id {self.channel.name} {motor} NEW`"
+                f"of its own with `ibrobot damiao set-id {self.channel.arguments} {motor} NEW`"
             )
         spans = [self.read(motor, register) for register in (MAX_POSITION, MAX_VELOCITY, MAX_TORQUE)]
-        if not all(0 < span < 1e4 for span in spans):
+        if not all(_LEAST <= span <= most for span, most in zip(spans, attrs.astuple(_MOST), strict=True)):
+            most = ", ".join(f"{most:g}" for most in attrs.astuple(_MOST))
             raise HardwareError(
                 f"{self.place(motor)}: its registers PMAX, VMAX, TMAX are {', '.join(f'{span:g}' for span in spans)}; "
-                "they must be above 0: set them with the motor's software"
+                f"they must be {_LEAST:g} to {most}: set them with the motor's software"
             )
         made = Motor(motor, answers[0][0].arbitration_id, Ranges(*spans))
         for other in self.motors.values():
+            for one, heard in ((made, other), (other, made)):
+                if other.id != motor and one.feedback_id == heard.id:
+                    raise HardwareError(
+                        f"{self.place(heard.id)}: has the feedback id of motor {one.id}, and would take its answers "
+                        "for commands; connect it alone, and give it an id below 17 with `ibrobot damiao set-id "
+                        f"{self.channel.arguments} {heard.id} NEW`"
+                    )
             if other.id != motor and _key(other) == _key(made):
                 raise HardwareError(
                     f"{self.place(motor)}: answers like motor {other.id}: both have feedback id "
-                    f"{made.feedback_id:#x}; `ibrobot damiao set-id {self.channel.name} {motor} {motor}` gives it "
+                    f"{made.feedback_id:#x}; `ibrobot damiao set-id {self.channel.arguments} {motor} {motor}` gives it "
                     f"{motor + 0x10:#x}"
                 )
         self.motors[motor] = made
@@ -242,7 +269,13 @@ class DamiaoBus:
                 self.send(motor, data)
             if motor in (replies := self.collect((motor,), time.monotonic() + _ANSWER_S)):
                 return replies[motor]
-        raise NoAnswer(f"{self.place(motor)}: does not answer; check its power and its cable")
+        raise NoAnswer(f"{self.place(motor)}: {self.silence(motor)}")
+
+    def silence(self, motor: int, when: str = "") -> str:
+        """What is wrong with a motor without usable feedback, and what to check."""
+        if motor in self._strange:
+            return f"answers what this driver does not know{when}: {self._strange[motor]}; check the motor's firmware"
+        return f"does not answer{when}; check its power and its cable"
 
     def refresh(self, motors: Collection[int], wait_s: float) -> dict[int, Feedback]:
         """The present feedback of motors, as far as it comes within `wait_s` [s] after the last was asked.
@@ -259,17 +292,19 @@ class DamiaoBus:
         """Wait for feedback of motors, up to `until_s` of `time.monotonic`."""
         owners = {_key(self.motors[motor]): motor for motor in motors}
         replies: dict[int, Feedback] = {}
-        while len(replies) < len(motors):
-            message = self._receive(max(0.0, until_s - time.monotonic()))
-            if message is None:
-                break
+        for motor in motors:
+            self._strange.pop(motor, None)
+        for message in self._until(until_s):
             if not message.data or (owner := owners.get((message.arbitration_id, message.data[0] & 0xF))) is None:
                 self.counters["strange_frames"] += 1
                 continue
             try:
                 replies[owner] = Feedback.decode(bytes(message.data), self.motors[owner].ranges)
-            except HardwareError:
+            except HardwareError as error:
                 self.counters["strange_frames"] += 1
+                self._strange[owner] = str(error)
+            if len(replies) == len(owners):
+                break
         return replies
 
     def command(self, motor: int, mit: MitCommand) -> None:
@@ -284,21 +319,23 @@ class DamiaoBus:
         Raises:
             TorqueStaysOn: if a motor still reports torque.
             NoAnswer: if one does not confirm it.
-            BusError: if the bus fails.
+            BusError: if the bus fails; the others have got the command as far as it takes frames.
         """
         for motor in motors:
-            self.send(motor, command(DISABLE))
-        silent: NoAnswer | None = None
+            with suppress(BusError):  # a full queue keeps no other motor's torque on; the second command reports it
+                self.send(motor, command(DISABLE))
+        trouble: list[HardwareError] = []
         for motor in motors:
             try:
                 state = self.ask(motor, command(DISABLE)).state
-            except NoAnswer as error:
-                silent = error
+            except HardwareError as error:
+                trouble.append(error)
                 continue
             if state != OFF and state not in ERRORS:
-                raise TorqueStaysOn(f"{self.place(motor)}: its torque stays on; cut its power before you touch the arm")
-        if silent is not None:
-            raise silent
+                stays = f"{self.place(motor)}: its torque stays on; cut its power before you touch the arm"
+                trouble.insert(0, TorqueStaysOn(stays))
+        if trouble:
+            raise trouble[0]
 
     def send(self, arbitration_id: int, data: bytes) -> None:
         """Send a frame.
@@ -319,8 +356,7 @@ class DamiaoBus:
         """The answers to a request for a register, which stop at the first."""
         self._drain()
         self.send(REGISTER_ID, request.encode())
-        until_s = time.monotonic() + _ANSWER_S
-        while (message := self._receive(max(0.0, until_s - time.monotonic()))) is not None:
+        for message in self._until(time.monotonic() + _ANSWER_S):
             register = self._of(message, motor)
             if register is not None and register.register == request.register:
                 return [(message, register)]
@@ -330,6 +366,13 @@ class DamiaoBus:
         """The register that a motor has answered with."""
         register = Register.decode(bytes(message.data)) if message.arbitration_id != REGISTER_ID else None
         return register if register is not None and register.motor == motor else None
+
+    def _until(self, until_s: float) -> Iterator[can.Message]:
+        """Frames up to a time of `time.monotonic`, and the first of those that are queued then."""
+        late = 0
+        while late < _LATE and (message := self._receive(max(0.0, until_s - time.monotonic()))) is not None:
+            late += time.monotonic() > until_s
+            yield message
 
     def _queued(self) -> list[can.Message]:
         """What has arrived already."""
@@ -350,7 +393,7 @@ class DamiaoBus:
             BusError: if the adapter fails, or the bus is off.
         """
         until_s = time.monotonic() + timeout_s
-        while True:
+        for _ in range(_DRAIN):
             try:
                 message = self._opened().recv(max(0.0, until_s - time.monotonic()))
             except (can.CanError, SerialException, OSError) as error:
@@ -366,6 +409,7 @@ class DamiaoBus:
                     f"{self.place()}: bus-off: the adapter has left the bus after too many errors; check that both "
                     f"ends have their 120 ohm, and the bit rates; {self.channel.remedy}"
                 )
+        return None
 
     def _opened(self) -> can.BusABC:
         if self._bus is None:

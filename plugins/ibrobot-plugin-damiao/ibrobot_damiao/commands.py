@@ -1,8 +1,8 @@
-"""`ibrobot damiao scan`, `zero`, `torque` and `set-id`."""
+"""`ibrobot damiao scan`, `zero`, `off` and `set-id`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
 import attrs
@@ -18,9 +18,9 @@ from ibrobot_core.app import (
     load_config,
     wrong_input,
 )
-from ibrobot_damiao.bus import Channel, DamiaoBus, NoAnswer
+from ibrobot_damiao.bus import BusError, Channel, DamiaoBus, NoAnswer
 from ibrobot_damiao.options import DamiaoOptions
-from ibrobot_damiao.protocol import ERRORS, OFF, ON, SAVE_ZERO, command
+from ibrobot_damiao.protocol import DEFAULT_BITRATE, DISABLE, ERRORS, OFF, ON, SAVE_ZERO, command
 
 _RETRIES = 5
 """Retries of the commands, which have no deadline."""
@@ -35,7 +35,7 @@ class OnChannel:
 
     channel: str = option(typed="CHANNEL", help="e.g. can0, or the serial port of an adapter that speaks slcan")
     interface: str = option("", help="interface type of python-can; by default socketcan, or slcan for a serial port")
-    bitrate: int = option(1_000_000, unit="bit/s", gt=0, help="rate of the bus; socketcan takes it from ip link")
+    bitrate: int = option(DEFAULT_BITRATE, unit="bit/s", gt=0, help="rate of the bus; socketcan takes it from ip link")
     data_bitrate: int | None = option(None, unit="bit/s", gt=0, help="rate of the data in CAN FD frames")
 
     @contextmanager
@@ -56,19 +56,27 @@ class OnChannel:
 
 @attrs.frozen(kw_only=True)
 class Scan(OnChannel):
-    """List the motors that answer: id, feedback id, state, position, temperature. Exit with 1 if there are none."""
+    """List the motors that answer: id, feedback id, state, position, temperature.
+
+    Exit with 1 if there are none, or one cannot be used.
+    """
 
     last: int = option(16, ge=1, le=0x7E, help="greatest id that is asked")
 
     def __call__(self) -> None:
-        rows = []
+        rows, unusable = [], 0
         with self.opened() as bus:
             bus.retries = 0  # most ids have no motor
             for motor in range(1, self.last + 1):
                 try:
-                    motor_there = bus.find(motor)
-                    feedback = bus.ask(motor)
-                except NoAnswer:
+                    if not _is_there(bus, motor, must=False):
+                        continue
+                    motor_there, feedback = bus.motors[motor], bus.ask(motor)
+                except BusError:
+                    raise
+                except HardwareError as error:
+                    unusable += 1
+                    rows.append(str(error))
                     continue
                 state, span = _STATES[feedback.state], motor_there.ranges
                 rows.append(
@@ -83,6 +91,8 @@ class Scan(OnChannel):
             )
         for row in rows:
             echo(row)
+        if unusable:
+            raise HardwareError(f"{self.channel}: {unusable} of {len(rows)} motors cannot be used, as listed")
 
 
 @attrs.frozen(kw_only=True)
@@ -129,21 +139,35 @@ class Zero:
 
 @attrs.frozen(kw_only=True)
 class Off(OnChannel):
-    """Switch motors off. The arm falls."""
+    """Switch motors off: those of ids 1 to 16, or of `--id`. The arm falls."""
 
     ids: tuple[int, ...] = option((), typed="--id", ge=1, le=0x7E, help="only this motor; may be repeated")
     yes: bool = option(False, help="do not ask")
 
     def __call__(self) -> None:
         with self.opened() as bus:
-            present = [motor for motor in self.ids or range(1, 17) if _is_there(bus, motor, must=bool(self.ids))]
-            if not present:
+            present, troubled = [], {}
+            for motor in self.ids or range(1, 17):
+                try:
+                    if _is_there(bus, motor, must=bool(self.ids)):
+                        present.append(motor)
+                except BusError:
+                    raise
+                except HardwareError as error:  # keeps no other motor's torque on, and may be a lost answer
+                    troubled[motor] = error
+            if not present and not troubled:
                 raise HardwareError(f"{self.channel}: no motor answers to ids 1 to 16; check the motors' power")
             echo("Without torque the arm falls: hold it, or check that it rests on something.")
             if not (self.yes or confirm("Torque off?", flag="--yes")):
                 raise Declined
+            for motor in troubled:
+                bus.send(motor, command(DISABLE))
             bus.switch_off(present)
-        echo(f"torque off: {', '.join(f'motor {motor}' for motor in present)}")
+        if present:
+            echo(f"torque off: {_listed(present)}")
+        if troubled:
+            reasons = "; ".join(map(str, troubled.values()))
+            raise HardwareError(f"torque off was sent to {_listed(troubled)}, but it is not confirmed: {reasons}")
 
 
 @attrs.frozen(kw_only=True)
@@ -164,6 +188,10 @@ class SetId(OnChannel):
             bus.switch_off([self.old])
             bus.set_id(self.old, self.new)
         echo(f"motor {self.old} is motor {self.new}, with feedback id {self.new + 0x10:#x}")
+
+
+def _listed(motors: Iterable[int]) -> str:
+    return ", ".join(f"motor {motor}" for motor in motors)
 
 
 def _is_there(bus: DamiaoBus, motor: int, *, must: bool) -> bool:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import attrs
 
 from ibrobot_core.api import OptionFault, did_you_mean, documented, not_empty, option
-from ibrobot_damiao.protocol import MAX_KD, MAX_KP
+from ibrobot_damiao.protocol import DEFAULT_BITRATE, MAX_KD, MAX_KP
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
@@ -40,7 +40,7 @@ class DamiaoOptions:
     )
     motors: Mapping[str, MotorOptions] = option(help="joint -> id, kp, kd, inverted and zero of its motor")
     interface: str = option("", help="interface type of python-can; by default socketcan, or slcan for a serial port")
-    bitrate: int = option(1_000_000, unit="bit/s", gt=0, help="rate of the bus; socketcan takes it from ip link")
+    bitrate: int = option(DEFAULT_BITRATE, unit="bit/s", gt=0, help="rate of the bus; socketcan takes it from ip link")
     data_bitrate: int | None = option(
         None, unit="bit/s", gt=0, help="rate of the data in CAN FD frames; without it, frames are classic ones"
     )

@@ -12,6 +12,8 @@ import attrs
 
 from ibrobot_core.api import HardwareError
 
+DEFAULT_BITRATE = 1_000_000
+"""Rate of a motor's bus as it comes [bit/s]."""
 REGISTER_ID = 0x7FF
 """CAN id on which every motor listens for requests that name a motor in their data."""
 READ, WRITE, SAVE, REFRESH = 0x33, 0x55, 0xAA, 0xCC

@@ -12,7 +12,17 @@ import pytest
 from ibrobot_damiao.arm import DamiaoArm
 from ibrobot_damiao.emulator import EmulatedMotor
 from ibrobot_damiao.options import DamiaoOptions, MotorOptions
-from ibrobot_damiao.protocol import ERRORS, MODE, Ranges
+from ibrobot_damiao.protocol import (
+    ERRORS,
+    MAX_POSITION,
+    MAX_TORQUE,
+    MAX_VELOCITY,
+    MODE,
+    OFF,
+    ON,
+    MitCommand,
+    Ranges,
+)
 from ibrobot_testing import HardwareSuite
 from ibrobot_testing.contexts import ARM, GRIPPER, control_context
 
@@ -289,6 +299,122 @@ def test_frames_of_others_are_counted_and_change_nothing(wire: MemoryBus.Wire, c
         assert not reading.stale
         np.testing.assert_array_equal(reading.position, before)
         assert arm.counters()["strange_frames"] >= 4
+
+
+@pytest.mark.parametrize("angle", [12.6, 13.0, 20.0, -13.0, 100.0])
+def test_torque_stays_off_where_a_motor_has_no_known_position(
+    angle: float, wire: MemoryBus.Wire, clock: SteppedClock
+) -> None:
+    """Held at the end of its range, a motor that is beyond it would turn to there."""
+    wire.motors[2].angle = angle
+    with (
+        pytest.raises(HardwareError, match=r"motor 2 .shoulder_lift.: is at or beyond the end of its range of 12.5"),
+        connected(clock),
+    ):
+        pass
+    assert wire.motors[2].angle == angle
+    assert not any(motor.state for motor in wire.motors.motors)
+
+
+def test_a_joint_that_leaves_the_range_of_its_motor_is_a_fault(wire: MemoryBus.Wire, clock: SteppedClock) -> None:
+    with connected(clock) as arm:
+        wire.motors[2].angle = 12.7
+        step(arm, clock)
+        (condition,) = arm.health()
+    assert (condition.joint, condition.quantity, condition.severity) == ("shoulder_lift", "position", Severity.FAULT)
+
+
+@pytest.mark.parametrize("end", [0.5, 1.0, 1.69])
+def test_limits_beyond_the_range_of_a_motor_are_refused(end: float, wire: MemoryBus.Wire, clock: SteppedClock) -> None:
+    """Commands beyond it would be cut to it in silence."""
+    wire.motors[2].registers[MAX_POSITION] = end
+    reason = rf"motor 2 .*-1.7 and 1.6 rad .*beyond its range of {end:g} rad"
+    with pytest.raises(HardwareError, match=reason), connected(clock):
+        pass
+    assert not any(motor.state for motor in wire.motors.motors)
+
+
+@pytest.mark.parametrize("register", [MAX_POSITION, MAX_VELOCITY, MAX_TORQUE])
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf"), 1e-30, 1e-3, 9999.0, 1e5])
+def test_ranges_that_cannot_be_are_refused(
+    register: int, value: float, wire: MemoryBus.Wire, clock: SteppedClock
+) -> None:
+    wire.motors[2].registers[register] = value
+    with pytest.raises(HardwareError, match=r"they must be 0\.1 to 200, 1000, 1000"), connected(clock):
+        pass
+
+
+@pytest.mark.parametrize("mode", [0, 2, 3, 4])
+def test_a_motor_with_torque_in_another_mode_is_left_as_it_is(
+    mode: int, wire: MemoryBus.Wire, clock: SteppedClock
+) -> None:
+    """In MIT mode it would go on with the last command that it had in it."""
+    motor = wire.motors[2]
+    motor.state, motor.registers[MODE], motor._command = ON, mode, MitCommand(1.0, 60.0, 1.0)
+    with (
+        pytest.raises(HardwareError, match=r"torque is on in another mode.*off arm --interface memory --id 2`"),
+        connected(clock),
+    ):
+        pass
+    assert (motor.registers[MODE], motor.state, motor.angle) == (mode, ON, 0.0)
+
+
+@pytest.mark.parametrize("state", sorted({*range(16)} - {OFF, ON, *ERRORS}))
+def test_a_state_that_is_unknown_is_named(state: int, wire: MemoryBus.Wire, clock: SteppedClock) -> None:
+    with connected(clock) as arm:
+        wire.motors[5].state = state
+        with pytest.raises(HardwareError, match=rf"motor 5 .wrist_roll.: answers .* for 4 ticks: {state} is no state"):
+            step(arm, clock, 4)
+
+
+def test_a_motor_that_would_hear_the_answers_of_another_is_refused(wire: MemoryBus.Wire, clock: SteppedClock) -> None:
+    """A motor takes each frame with its id for a command, whoever has sent it."""
+    wire.motors.motors.append(EmulatedMotor(0x11))
+    motors = {**options().motors, "gripper": MotorOptions(id=0x11)}
+    with (
+        pytest.raises(HardwareError, match=r"motor 17 .gripper.: has the feedback id of motor 1, .*set-id arm "),
+        connected(clock, motors=motors),
+    ):
+        pass
+    assert not any(motor.state for motor in wire.motors.motors)
+
+
+def test_a_flood_of_frames_ends_no_read(
+    wire: MemoryBus.Wire, clock: SteppedClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class EndlessError(Exception):
+        pass
+
+    left = iter(range(200_000))
+    receive = MemoryBus._recv_internal
+
+    def flooded(bus: MemoryBus, timeout: float | None) -> tuple[can.Message | None, bool]:
+        message, filtered = receive(bus, timeout)
+        if message is None and next(left, None) is None:
+            raise EndlessError
+        return message or can.Message(arbitration_id=0x500, data=bytes(8), is_extended_id=False), filtered
+
+    with connected(clock) as arm:
+        wire.motors[3].silent = True
+        monkeypatch.setattr(MemoryBus, "_recv_internal", flooded)
+        assert arm.read().stale
+
+
+@pytest.mark.parametrize("first", range(6))
+def test_a_full_queue_leaves_no_other_motor_with_torque(
+    first: int, wire: MemoryBus.Wire, clock: SteppedClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    send, sent = MemoryBus.send, iter(range(100))
+
+    def full(bus: MemoryBus, msg: can.Message, timeout: float | None = None) -> None:
+        if first <= next(sent) < first + 3:
+            raise can.CanOperationError("No buffer space available")
+        send(bus, msg, timeout)
+
+    with connected(clock) as arm:
+        monkeypatch.setattr(MemoryBus, "send", full)
+        arm.relax()
+    assert not any(motor.state for motor in wire.motors.motors)
 
 
 def test_a_joint_without_a_motor_and_a_motor_without_a_joint_are_refused(clock: SteppedClock) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -108,6 +109,52 @@ def test_off_takes_the_torque_of_those_that_are_there(adapter: SlcanServer) -> N
     assert code == 0
     assert "torque off: motor 1, motor 5" in screen
     assert [motor.state for motor in adapter.motors.motors] == [0, 1, 0]
+
+
+def test_off_takes_the_torque_of_the_others_if_one_does_not_answer(adapter: SlcanServer) -> None:
+    """As the end of a run prints the command, with the ids of all motors."""
+    for motor in adapter.motors.motors:
+        motor.state = 1
+    adapter.motors[2].silent = True
+    code, screen = ran("off", adapter.channel, "--id", "2", "--id", "1", "--id", "5", "--yes")
+    assert code == 1
+    assert "torque off: motor 1, motor 5" in screen
+    assert re.search("sent to motor 2, but it is not confirmed: .*motor 2: does not answer", screen)
+    assert [motor.state for motor in adapter.motors.motors] == [0, 1, 0]
+
+
+def test_off_and_scan_reach_motors_that_cannot_be_used(adapter: SlcanServer) -> None:
+    adapter.motors.motors.append(EmulatedMotor(2, feedback_id=0x44))
+    adapter.motors[5].registers[21] = 9999.0
+    for motor in adapter.motors.motors:
+        motor.state = 1
+    code, screen = ran("scan", adapter.channel, "--last", "6")
+    assert code == 1
+    assert re.search(
+        "motor 1: feedback id 0x11, torque on, .*\n.*motor 2: 2 motors have .*\n.*motor 5: .*9999,", screen
+    )
+    assert "2 of 3 motors cannot be used" in screen
+    code, screen = ran("off", adapter.channel, "--id", "1", "--id", "2", "--id", "5", "--yes")
+    assert code == 1
+    assert "torque off: motor 1" in screen
+    assert "sent to motor 2, motor 5, but it is not confirmed" in screen
+    assert not any(motor.state for motor in adapter.motors.motors)
+
+
+def test_command_that_takes_the_torque_off_has_all_that_it_needs(adapter: SlcanServer) -> None:
+    channel = Channel(adapter.channel, "slcan", 500_000)
+    adapter.motors[1].state = 1
+    code, screen = ran("off", *shlex.split(channel.arguments), "--id", "1", "--yes")
+    assert (code, adapter.motors[1].state) == (0, 0), screen
+    assert Channel("can0").arguments == "can0"
+    assert Channel("a b", data_bitrate=5_000_000).arguments == "'a b' --data-bitrate 5000000"
+
+
+@pytest.mark.parametrize("interface", ["socketcand", "neovi", "serial", "usb2can", "pcan", "etas"])
+def test_interface_that_cannot_be_used_so_is_one_error(interface: str) -> None:
+    code, screen = ran("scan", "nowhere", "--interface", interface)
+    assert code == 1
+    assert "error: nowhere: " in screen
 
 
 def test_off_without_an_answer_changes_nothing(adapter: SlcanServer) -> None:
