@@ -8,14 +8,13 @@ and arrays are numpy.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-if TYPE_CHECKING:
-    from ibrobot_core.descriptors import MessageDescriptor
+from ibrobot_core import plugin_messages
 
 _EQUAL = attrs.cmp_using(eq=np.array_equal)
 _NOTHING: Any = ()
@@ -410,7 +409,7 @@ class MessageTypes(Mapping[str, type[Message]]):
 
     def __getitem__(self, name: str) -> type[Message]:
         """The class; asks plugins only for a type that core lacks."""
-        return self._own[name] if name in self._own else self._of_plugins()[name].load()
+        return self._own[name] if name in self._own else cast("type[Message]", self._of_plugins()[name].load())
 
     def __contains__(self, name: object) -> bool:
         """Whether there is one; imports no class."""
@@ -424,15 +423,13 @@ class MessageTypes(Mapping[str, type[Message]]):
         """How many there are."""
         return sum(1 for _ in self)
 
-    def _of_plugins(self) -> Mapping[str, MessageDescriptor]:
+    def _of_plugins(self) -> Mapping[str, Any]:
         """Discovers the plugins. One that asks while it is loaded sees only core's types."""
-        from ibrobot_core.plugins import installed_plugins
-
         if self._asking:
             return {}
         self._asking = True
         try:
-            return installed_plugins().messages
+            return plugin_messages.source()
         finally:
             self._asking = False
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 import attrs
 import pluggy
 
-from ibrobot_core import descriptors, hookspecs
+from ibrobot_core import descriptors, hookspecs, plugin_messages
 from ibrobot_core.errors import (
     ContractError,
     MissingDependency,
@@ -492,3 +492,6 @@ def discover(points: Iterable[EntryPoint] | None = None) -> Registry:
 def installed_plugins() -> Registry:
     """The registry of the installed plugins, discovered once per process."""
     return discover()
+
+
+plugin_messages.source = lambda: installed_plugins().messages
