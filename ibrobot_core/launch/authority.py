@@ -182,8 +182,9 @@ class Authority:
             if session.held:
                 session.bus.call("/set_mode", session.mode)
             numbers = joint_selection(session.config.robot, tuple(grant.region)) if grant.region else None
-            if numbers is not None and numbers.size != len(grant.bounds):
-                raise RequestError(f"{ARM.name}: region: {', '.join(grant.region)} are {numbers.size} numbers")
+            for path, bounds in grant.region.items():
+                if (size := joint_selection(session.config.robot, (path,)).size) != len(bounds):
+                    raise RequestError(f"{ARM.name}: region: {path} are {size} numbers")
             scope = Scope(chosen[0], grant, session.clock.now_ns() + ns(grant.seconds), numbers)
             if outside := self._outside(scope):
                 raise HardwareError(f"{ARM.name}: the robot is not in the region: {outside}; drive it there first")
@@ -202,15 +203,21 @@ class Authority:
         self.renew(agent)
         service = self._session.bus.services().get(name)
         facts = {"service": name, "request": json.dumps(request, default=str)[:_MOST_REQUEST]}
+        grant: Grant | None = None
         token = ACTING.set(agent)
         try:
             if service is not None and not (service.reads or service.urgent):
                 if service.persons:
                     raise NotSupported(f"{name} is for persons only: ask one")
-                if name not in (granted := self._granted(agent, name).services):
-                    raise HardwareError(f"{name} is not granted; granted: {', '.join(granted) or 'nothing'}")
+                grant = self._granted(agent, name)
+                if name not in grant.services:
+                    raise HardwareError(f"{name} is not granted; granted: {', '.join(grant.services) or 'nothing'}")
                 self._called[name] = service
             answer = self._session.bus.call(name, request)
+            if grant is not None and self.status().grant is not grant:
+                if service is not None and service.cancel:  # it began after `end` has cancelled what was there
+                    self._session.bus.call(service.cancel)
+                raise HardwareError(f"{name}: the authority ended during the call: {self._ended}")
         except Exception as error:
             self._note("refused", agent, **facts, why=str(error)[:_MOST_REQUEST])
             raise
@@ -271,10 +278,11 @@ class Authority:
         self._note("ended", scope.agent, why=why)
         acts: list[Callable[[], object]] = [session.hold] if hold else []
         acts += [partial(session.bus.call, service.cancel) for service in self._called.values() if service.cancel]
-        acts.append(partial(session.control.call, LimitSpeed(1.0)))
         for act in acts:
             with suppress(IbrobotError):  # the service is of another mode, or the run ends
                 act()
+        with suppress(IbrobotError), session.changing:  # another grant may have been given meanwhile
+            session.control.call(LimitSpeed(self.speed))
 
     def check_path(self, positions: Vector, fastest: float) -> None:
         """Check the path of a goal of anybody against the present scope.

@@ -207,16 +207,16 @@ class Session:
 
     def send_plan(self, start_ns: int, step_ns: int, joints: tuple[str, ...], positions: Vector) -> None:
         """Send control a plan: positions [rad], shape (N, len(joints)), the first at `start_ns` [ns]."""
-        if not self.authority.admits_plan(joints, positions):
-            return
         robot = self.config.robot
         columns = robot.indices(joints)
         mask = np.zeros(len(robot.joints), dtype=bool)
         mask[columns] = True
         full = np.zeros((len(positions), len(robot.joints)))
         full[:, columns] = positions
-        self.plan = run_state.PlanRecord(self.generation, start_ns, step_ns, mask, full)
-        self.control.write_plan(self.plan)
+        with self.authority.lock:  # no plan overtakes the end of an agent's authority
+            if self.authority.admits_plan(joints, positions):
+                self.plan = run_state.PlanRecord(self.generation, start_ns, step_ns, mask, full)
+                self.control.write_plan(self.plan)
 
     def send_goal(self, executor: str, goal_id: str, goal: ExecutorGoal, stops: int | None = None) -> None:
         """Send a goal to an executor of the present mode: the one door for the goals of every client.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextvars import Context
 from pathlib import Path
 from typing import Any
 
@@ -221,6 +222,38 @@ def test_person_who_enters_the_present_mode_stops_what_the_agent_has_begun(run: 
     assert not run.session.held
 
 
+@pytest.mark.parametrize("service", [GO_TO, "/move_action", "/execute_trajectory"])
+def test_call_that_was_under_way_when_a_person_took_over_moves_nothing(run: AgentRun, service: str) -> None:
+    bus = run.session.bus
+    declared = bus.services()[service]
+    handler = bus._servers[service].handler
+
+    def slow(request: Any) -> Any:
+        Context().run(bus.call, "/set_mode", "moveit_planning")
+        return handler(request)
+
+    bus.unserve(service)
+    bus.serve(declared, slow)
+    run.grant(services=(service,))
+    joints = run.session.config.executors["arm_trajectory"].joints
+    there = run.commands[-1][run.session.config.robot.indices(joints)] + 0.3 * np.eye(len(joints))[0]
+    point = {"positions": there.tolist(), "time_from_start_ns": 2_000_000_000}
+    requests = {
+        GO_TO: AWAY,
+        "/move_action": {"goals": [{"joints": {"shoulder_pan": 1.2}}]},
+        "/execute_trajectory": {"joint_names": list(joints), "points": [point]},
+    }
+    refused = ""
+    try:
+        run.authority.call(run.agent, service, requests[service])
+    except HardwareError as error:
+        refused = str(error)
+    assert run.moved(200) < 1e-3
+    assert f"{service}: the authority ended during the call" in refused
+    bus.unserve(service)
+    bus.serve(declared, handler)
+
+
 def test_agent_enters_modes_that_are_granted(run: AgentRun) -> None:
     run.grant(services=(GO_TO, "/set_mode"))
     run.authority.call(run.agent, "/set_mode", "web")
@@ -242,6 +275,7 @@ def test_grant_is_for_one_connection(run: AgentRun) -> None:
         run.go(agent=again)
 
 
+WIDE = ((-1.0, 1.0),) * 2
 REGION = {"tool.position": ((0.1, 0.4), (-0.12, 0.12), (0.0, 0.4))}
 
 
@@ -300,6 +334,11 @@ def test_goal_out_of_the_region_moves_nothing(run: AgentRun) -> None:
     [
         ({"tool.nothing": ((0.0, 1.0),)}, ContractError, "the tool has no 'nothing'"),
         ({"tool.position": ((0.0, 1.0),)}, RequestError, "tool.position are 3 numbers"),
+        (
+            {"tool.position": ((-1.0, 1.0),) * 2, "position.shoulder_pan": ((-1.0, 1.0),) * 2},
+            RequestError,
+            "are 3 numbers",
+        ),
         ({"tool.position": ((0.9, 1.0),) * 3}, HardwareError, "the robot is not in the region: ee.x would be"),
         ({"position.shoulder_pan": ((1.0, 1.0),)}, ValueError, r"give \[least, greatest\] for each number"),
     ],

@@ -1,0 +1,78 @@
+"""What happens at the same moment as the end of an agent's authority, with a control that notes its commands."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+from ibrobot_testing import make_session, stand_in
+
+from ibrobot_core.control.commands import CancelGoals, LimitSpeed
+from ibrobot_core.launch.authority import Authority, Grant
+from ibrobot_core.launch.session import Session
+
+GRANT = Grant(60.0, ("/test/move",), speed=0.2)
+
+
+def armed(call: Callable[[Any], None], write_plan: Callable[[Any], None]) -> tuple[Session, Authority]:
+    session = make_session()
+
+    def carried_out(command: Any, **more: Any) -> dict[str, Any]:
+        call(command)
+        return {}
+
+    control = {"report": {"loop": {}, "counters": {}}, "running": True, "call": carried_out, "write_plan": write_plan}
+    session.control = cast("Any", SimpleNamespace(**control, stops=0))
+
+    def enter(_: Any) -> None:
+        session.held = False
+
+    session.bus.serve(stand_in("/set_mode"), enter)
+    authority = session.authority
+    authority.open()
+    authority.join("claude")
+    authority.arm(GRANT)
+    return session, authority
+
+
+def test_plan_that_was_admitted_does_not_overtake_the_end_of_the_authority() -> None:
+    plans: list[Any] = []
+    session, authority = armed(lambda command: None, plans.append)
+    ending = threading.Thread(target=authority.end, args=("disarmed",))
+    admits = authority.admits_plan
+
+    def late(joints: tuple[str, ...], positions: Any) -> bool:
+        admitted = admits(joints, positions)
+        ending.start()
+        ending.join(0.3)
+        return admitted
+
+    authority.admits_plan = late  # type: ignore[method-assign]
+    joints = session.config.robot.joint_names
+    session.send_plan(0, 1, joints, np.ones((5, len(joints))))
+    ending.join()
+    assert len(plans) == 3, "the plan, and the brake twice"
+    assert not plans[-1].mask.any()
+    authority.close()
+
+
+def test_end_of_an_authority_does_not_lift_the_speed_limit_of_the_next_one() -> None:
+    speeds: list[float] = []
+    again: list[Grant] = []
+
+    def call(command: Any) -> None:
+        if isinstance(command, LimitSpeed):
+            speeds.append(command.fraction)
+        if isinstance(command, CancelGoals) and again:
+            authority.arm(again.pop())
+
+    _, authority = armed(call, lambda plan: None)
+    again.append(GRANT)
+    authority.end("its time is over")
+    assert authority.status().grant is GRANT
+    assert speeds[-1] == GRANT.speed
+    authority.close()
+    assert speeds[-1] == 1.0
