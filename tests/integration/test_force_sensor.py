@@ -38,12 +38,12 @@ def device() -> Iterator[EmulatedNetFt]:
         count = 0
         while not ended.wait(0.005):
             count += 1
-            sensor.measure((0, 0, 1000 * count, -count, 0, 0))
+            device.measure((0, 0, 1000 * count, -count, 0, 0))
 
-    with EmulatedNetFt() as sensor:
+    with EmulatedNetFt() as device:
         thread = threading.Thread(target=measure)
         thread.start()
-        yield sensor
+        yield device
         ended.set()
         thread.join()
 

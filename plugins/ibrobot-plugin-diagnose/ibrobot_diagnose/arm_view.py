@@ -64,6 +64,9 @@ def _drawn(
     views = installed_plugins().of_kind(ARM_VIEW)
     if not views:
         raise IbrobotError("no installed package draws it; ibrobot-plugin-mujoco does")
+    known = set(config.robot.joint_names)
+    if foreign := [joint for rig in rigs for joint in rig.joints if joint not in known]:
+        raise IbrobotError(f"the robot has no joint {foreign[0]!r}, as the reference has")
     height, width = pair[0].stills[0].picture.shape[:2]
     columns = [config.robot.indices(rig.joints) for rig in rigs]
     with closing(views[0].make(config, name, info, (height, width))) as view:  # type: ignore[call-arg, arg-type]

@@ -162,7 +162,9 @@ class Card:
             if facts.get("version") != VERSION:
                 raise ValueError(f"it has version {facts.get('version')!r}; this ibrobot reads version {VERSION}")
             return cls._of(facts)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        except KeyError as error:
+            problem = ValueError(f"it lacks {error.args[0]!r}")
+        except (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
             problem = error
         raise DatasetError(f"{path}: cannot be read as a card of data: {problem}")
 

@@ -6,6 +6,7 @@ import base64
 import json
 import math
 from collections.abc import Mapping
+from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 import attrs
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 type Floats = NDArray[np.float64]
 
+_FARTHEST = 1e4
+"""No joint is turned farther [rad]."""
 STILL_WIDTH = 320
 """Width of stills [pixels]; between this and twice as much."""
 
@@ -97,12 +100,16 @@ class Rig:
             ValueError, KeyError, TypeError, AttributeError: if they are damaged.
         """
         joints = tuple(str(each) for each in facts["joints"])
+        if len(set(joints)) != len(joints):
+            raise ValueError(f"a joint is listed twice in {', '.join(joints)}")
+        if taken := str(facts["taken"]):
+            datetime.fromisoformat(taken)
         calibration = {
             str(name): {str(joint): dict(numbers) for joint, numbers in each.items()}
             for name, each in facts["calibration"].items()
         }
         return cls(
-            str(facts["robot"]), str(facts["taken"]), joints,
+            str(facts["robot"]), taken, joints,
             {str(key): _camera_of(each, len(joints)) for key, each in facts["cameras"].items()},
             _number(facts["loop_hz"], "loop_hz"), _number(facts["asked_hz"], "asked_hz"), calibration,
             {str(name): str(each) for name, each in facts["versions"].items()}, str(facts["fingerprint"]),
@@ -121,7 +128,10 @@ def _finite(value: Any, name: str) -> float:
 
 
 def _number(value: Any, name: str) -> float | None:
-    return None if value is None else _finite(value, name)
+    number = None if value is None else _finite(value, name)
+    if number is not None and number <= 0:
+        raise ValueError(f"{name}: {value!r} is not above 0")
+    return number
 
 
 def _camera_facts(camera: RigCamera) -> dict[str, Any]:
@@ -144,8 +154,14 @@ def _camera_of(facts: Mapping[str, Any], joints: int) -> RigCamera:
         pose = np.array([math.nan if value is None else _finite(value, "pose") for value in each["pose"]])
         if pose.shape != (joints,):
             raise ValueError(f"the pose of a still has {pose.size} joints, must have {joints}")
+        if np.abs(pose[np.isfinite(pose)]).max(initial=0.0) > _FARTHEST:
+            raise ValueError(f"the pose of a still is beyond {_FARTHEST:g} rad")
         stills.append(Still(read_png(base64.b64decode(each["picture"], validate=True)), pose))
+    if not stills:
+        raise ValueError("a camera has no still")
     height, width = (int(each) for each in facts["size"])
+    if height <= 0 or width <= 0:
+        raise ValueError(f"the size of a camera, {height} x {width}, is not above 0")
     stands = facts["stands"]
     if not isinstance(stands, bool | None):
         raise ValueError(f"stands must be true, false or null, not {stands!r}")

@@ -51,6 +51,29 @@ def test_arm_that_stands_elsewhere_is_no_fault(reference):
     assert (code, unwell(facts)) == (0, {"zero_shifted": "cannot tell"})
 
 
+def changed(reference, file, change):
+    """A copy of the reference, edited by hand."""
+    facts = json.loads(reference.read_text())
+    change(facts["rig"])
+    file.write_text(json.dumps(facts))
+    return file
+
+
+def test_reference_of_another_robot_fails(reference, tmp_path):
+    other = changed(reference, tmp_path / "other.json", lambda rig: rig.update(robot="koch", joints=[*"abcdef"]))
+    done = run_here("preflight", *SIM, "--against", other)
+    assert done.returncode == 1, done.stderr
+    assert "FAIL  other_robot: The reference is of koch with other joints: a, b, c, d, e, elbow_flex, f," in done.stdout
+    assert "note  the arm is not masked in top: the robot has no joint 'a', as the reference has" in done.stdout
+
+
+def test_camera_that_the_reference_lacks_is_uncertain(reference, tmp_path):
+    less = changed(reference, tmp_path / "less.json", lambda rig: rig["cameras"].pop("observation.images.top"))
+    code, facts = preflight("--against", less)
+    assert (code, unwell(facts)["camera_unknown"]) == (0, "cannot tell")
+    assert any(line.startswith("?     camera_unknown: top: not in the reference") for line in facts["lines_of_text"])
+
+
 def test_camera_that_moved_fails_with_a_report(reference, tmp_path):
     done = run_here(
         "preflight", *SIM, "--against", reference, "--out", tmp_path,

@@ -136,6 +136,10 @@ def changed(**numbers):
         ({"leaders": {"leader": {"pan": 0.08, "lift": 0.0}}}, "leader_apart", "warn"),
         ({"leaders": {"leader": dict.fromkeys(("pan", "lift", "elbow"), 0.9)}}, "leader_apart", "cannot tell"),
         ({"leaders": {}, "notes": ("leader cannot be read: no port",)}, "leader_apart", "cannot tell"),
+        ({"robot": "other_arm"}, "other_robot", "warn"),
+        ({"joints": THEN.joints[::-1]}, "other_robot", "warn"),
+        ({"joints": (*THEN.joints[:-1], "thumb")}, "other_robot", "fail"),
+        ({"cameras": {**THEN.cameras, WRIST: THEN.cameras[TOP]}}, "camera_unknown", "cannot tell"),
         ({"conditions": ({"message": "hot", "severity": "warning"},)}, "joints_unwell", "warn"),
         ({"conditions": ({"message": "dead", "severity": "fault"},)}, "joints_unwell", "fail"),
     ],
@@ -195,6 +199,46 @@ def read(file, facts):
         return Card.read(file).rig, ""
     except DatasetError as error:
         return None, str(error)
+
+
+IMPOSSIBLE = {
+    "no still": (("cameras", TOP, "stills"), []),
+    "a joint twice": (("joints",), ["pan"] * len(THEN.joints)),
+    "no date": (("taken",), "today\nrig is as in the reference"),
+    "negative loop": (("loop_hz",), -5.0),
+    "no loop": (("loop_hz",), 0),
+    "infinite loop": (("loop_hz",), 10**400),
+    "negative rate": (("cameras", TOP, "rate_hz"), -1),
+    "no focal length": (("cameras", TOP, "focal"), 0),
+    "no size": (("cameras", TOP, "size"), [0, 0]),
+    "negative size": (("cameras", TOP, "size"), [240, -320]),
+    "infinite size": (("cameras", TOP, "size"), [float("inf"), 320]),
+    "pose far away": (("cameras", TOP, "stills", 0, "pose"), [1e308] * len(THEN.joints)),
+}
+
+
+@pytest.mark.parametrize("mistake", IMPOSSIBLE)
+def test_numbers_that_no_rig_has_are_refused(mistake, tmp_path):
+    """Compared with them, a rig would be found well."""
+    facts = card(THEN).facts()
+    *places, last = IMPOSSIBLE[mistake][0]
+    at = facts["rig"]
+    for place in places:
+        at = at[place]
+    at[last] = IMPOSSIBLE[mistake][1]
+    known, error = read(tmp_path / "card.json", facts)
+    assert known is None
+    assert "card.json: cannot be read as a card of data: " in error
+
+
+@pytest.mark.parametrize(
+    "text", ['{"schema":' + "[" * 100_000, '{"schema": "ibrobot card", "version": 1, "joints": [], "episodes": 1e999}']
+)
+def test_file_that_is_no_card_is_refused(text, tmp_path):
+    file = tmp_path / "card.json"
+    file.write_text(text)
+    with pytest.raises(DatasetError, match="cannot be read as a card of data"):
+        Card.read(file)
 
 
 def test_damaged_rigs_are_refused_or_read(tmp_path):

@@ -42,6 +42,48 @@ class RigCause(CardCause):
         return self.compare_rigs(window.rig, card.rig)
 
 
+class OtherRobot(RigCause):
+    """The reference is of another robot."""
+
+    name, title = "other_robot", "the reference is of this robot"
+    explains = frozenset({"other_contract", "other_calibration", "camera_missing"})
+    remedy = "Compare with a reference of this robot: `ibrobot preflight ROBOT --take FILE` takes one."
+
+    @override
+    def compare_rigs(self, now: Rig, then: Rig) -> Evidence | None:
+        differs = sorted(set(now.joints) ^ set(then.joints))
+        if differs:
+            text = f"The reference is of {_called(then)} with other joints: {', '.join(differs)}."
+        elif now.joints != then.joints:
+            text = f"The reference has the joints in another order: {', '.join(then.joints)}."
+        elif then.robot and now.robot != then.robot:
+            text = f"The reference is of {_called(then)}, and this is {now.robot}."
+        else:
+            return Evidence(f"The reference is of {_called(now)}.", 0.0, "differences", 1.0, 0.0, fails=2.0)
+        number = 2.0 if differs else 1.0
+        return Evidence(text, number, "differences", 1.0, likelihood(number, 0.5, 2.0), fails=2.0)
+
+
+def _called(rig: Rig) -> str:
+    return rig.robot or "a robot without a name"
+
+
+class CameraUnknown(RigCause):
+    """A camera is not in the reference."""
+
+    name, title = "camera_unknown", "every camera is in the reference"
+    remedy = "Take a reference with it: `ibrobot preflight ROBOT --take FILE`."
+
+    @override
+    def compare_rigs(self, now: Rig, then: Rig) -> Evidence | None:
+        unknown = [name_of(key) for key in now.cameras if key not in then.cameras]
+        number = float(len(unknown))
+        if not unknown:
+            return Evidence("The reference has every camera.", number, "cameras", 1.0, 0.0)
+        unclear = f"{', '.join(unknown)}: not in the reference, so nothing says whether what it shows is as it was"
+        return Evidence(unclear, number, "cameras", 1.0, 0.0, unclear=unclear)
+
+
 class CameraMissing(RigCause):
     """A camera of the reference does not deliver pictures."""
 
@@ -377,6 +419,6 @@ class OtherVersions(RigCause):
 
 
 CAUSES: tuple[type[Cause], ...] = (
-    CameraMissing, OtherResolution, CameraSlow, CameraOptions, LoopSlow, OtherCalibration, OtherGripper, ZeroShifted,
-    LeaderApart, JointsUnwell, OtherContract, OtherVersions,
+    OtherRobot, CameraMissing, CameraUnknown, OtherResolution, CameraSlow, CameraOptions, LoopSlow, OtherCalibration,
+    OtherGripper, ZeroShifted, LeaderApart, JointsUnwell, OtherContract, OtherVersions,
 )  # fmt: skip
