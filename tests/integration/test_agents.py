@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import hostile_agents
-import numpy as np
 import pytest
 from ibrobot_mcp.door import AgentDoor
 from ibrobot_mcp.stdio import Pipes
@@ -286,11 +285,6 @@ class Worker:
                 return await self.step("gripper", position=-0.1, grasp=name)
         return False
 
-    async def place(self, name: str) -> Any:
-        """Where an object is by the scene's ground truth [m]."""
-        world = await self.call("world")
-        return world["answer"]["objects"][name]["pose"]["position"]
-
 
 @pytest.mark.long
 @pytest.mark.parametrize("mode", ["auto", "legacy"])
@@ -307,9 +301,9 @@ def test_scripted_agent_does_ten_tasks_of_increasing_length(tmp_path: Path, mode
             agent = Worker(client)
             assert (await agent.call("state"))["mode"] == "planned"
             grant = [*command[:3], "agent", "arm", "--yes", "--speed", "0.6", "--seconds", "600"]
-            await asyncio.to_thread(subprocess.run, grant, env=environment, check=True, capture_output=True)
+            granted = await asyncio.to_thread(subprocess.run, grant, env=environment, capture_output=True, text=True)
+            assert granted.returncode == 0, granted.stderr
             joints = {"shoulder_pan": 0.3}
-            start = await agent.place("cube")
 
             async def position(joint: str) -> float:
                 return float((await agent.call("state"))["joints"][joint]["position_rad"])
@@ -324,11 +318,10 @@ def test_scripted_agent_does_ten_tasks_of_increasing_length(tmp_path: Path, mode
             succeeded.append(await agent.above("cube", 0.12, tolerance=0.4))
             succeeded.append(await agent.grasp("cube"))
             await agent.step("move", line=[{"xyz": [0, 0, 0.07], "relative": True}], touch=["table"])
-            succeeded.append((await agent.place("cube"))["z"] > start["z"] + 0.04)
+            succeeded.append(await position("gripper") > 0.02)  # it closes to -0.1 without something between its jaws
             over = {"object": "bin_floor", "xyz": [0, 0, 0.09], "axis": "down", "angle_tolerance": 0.3}
             await agent.step("move", **over)
-            cube, floor = await agent.place("cube"), await agent.place("bin_floor")
-            succeeded.append(np.hypot(cube["x"] - floor["x"], cube["y"] - floor["y"]) < 0.06)
+            succeeded.append(await position("gripper") > 0.02)
             await agent.step("gripper", position=0.6, release="cube")
             for _ in range(100):
                 if (await agent.call("state"))["scene_succeeded"]:

@@ -84,7 +84,7 @@ class Persons:
 
 def running() -> Iterator[Path]:
     """The sockets of the robots that run here."""
-    for path in sorted(sockets_folder().iterdir()):
+    for path in sorted(each for each in sockets_folder().iterdir() if each.is_socket()):
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
             try:
                 probe.connect(str(path))

@@ -239,6 +239,7 @@ def test_socket_of_a_killed_run_goes_and_garbage_ends_nothing(door: AgentDoor) -
     left = sockets_folder() / "dead.1"
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as old:
         old.bind(str(left))
+    (sockets_folder() / "folder").mkdir()
     (path,) = running()
     assert not left.exists()
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as garbage:
