@@ -18,10 +18,10 @@ from rosbags.typesys.store import Typestore
 
 from ibrobot_core import api as core
 from ibrobot_core.api import MESSAGE_TYPES, NS_PER_S, Message
+from ibrobot_ros2.definitions import TIMES, core_name
 
 Convert = Callable[[Any], Any]
 
-_TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 _TRANSFORM = "geometry_msgs/msg/Transform"
 _PARTS: dict[str, type[Any]] = {
     "std_msgs/msg/Header": core.Header,
@@ -52,7 +52,7 @@ def make_class(type_name: str, types: Typestore) -> type[Any]:
     fields: dict[str, Any] = {}
     for name, desc in types.fielddefs[type_name][1]:
         array = desc[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) and dtype_of(desc[1][0]) is not None
-        fields[_core_name(name, desc)] = attrs.field(eq=attrs.cmp_using(eq=np.array_equal) if array else True)
+        fields[core_name(name, desc)] = attrs.field(eq=attrs.cmp_using(eq=np.array_equal) if array else True)
     body = {"ros_type": type_name}
     return attrs.make_class(type_name.rpartition("/")[2], fields, bases=(Message,), class_body=body, frozen=True)
 
@@ -76,7 +76,7 @@ def _constant(value: Any, types: Typestore) -> Convert:
 
 
 def _encode_field(name: str, desc: Any, types: Typestore) -> Convert:
-    get = attrgetter(_core_name(name, desc))
+    get = attrgetter(core_name(name, desc))
     kind, inner = desc
     if kind == Nodetype.BASE:
         return get
@@ -95,7 +95,7 @@ def _encode_field(name: str, desc: Any, types: Typestore) -> Convert:
 
 
 def _encode_part(type_name: str, types: Typestore) -> Convert:
-    if type_name not in _TIMES:
+    if type_name not in TIMES:
         return encoder(type_name, types)
     time: Any = types.types[type_name]
     return lambda stamp_ns: time(*divmod(stamp_ns, NS_PER_S))
@@ -123,7 +123,7 @@ def decoder(type_name: str, cls: type[Any], types: Typestore, class_of: Callable
                 parts.append((part, _chain(attrgetter(name), _decode_field(part, part_desc, types, class_of))))
             continue
         part_of = _decode_field(name, desc, types, class_of)
-        parts.append((_core_name(name, desc), part_of))
+        parts.append((core_name(name, desc), part_of))
     return lambda ros: cls(**{name: part(ros) for name, part in parts})
 
 
@@ -146,15 +146,9 @@ def _chain(first: Convert, second: Convert) -> Convert:
 
 
 def _decode_part(type_name: str, types: Typestore, class_of: Callable[[str], type[Any]]) -> Convert:
-    if type_name in _TIMES:
+    if type_name in TIMES:
         return lambda time: time.sec * NS_PER_S + time.nanosec
     return decoder(type_name, class_of(type_name), types, class_of)
-
-
-def _core_name(name: str, desc: Any) -> str:
-    kind, inner = desc
-    named = inner[0] if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else desc
-    return f"{name}_ns" if named[0] == Nodetype.NAME and named[1] in _TIMES else normalize_fieldname(name)
 
 
 def dtype_of(item: Any) -> np.dtype[Any] | None:

@@ -6,12 +6,15 @@ import threading
 from importlib.resources import files
 from typing import Any
 
+import attrs
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
-from ibrobot_core.api import MESSAGE_TYPES, IbrobotError
+from ibrobot_core.api import MESSAGE_TYPES, IbrobotError, Message
 
+TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 _PACKAGE = "ibrobot_msgs"
 _SEPARATOR = "=" * 80 + "\n"
 _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
@@ -165,6 +168,8 @@ def type_hash(type_name: str, types: Typestore | None = None) -> str:
         return known(type_name, types).hash_rihs01(type_name)
     except KeyError as error:
         raise CodecError(f"{type_name}: needs {error}, which is not defined") from None
+    except RecursionError:
+        raise CodecError(f"{type_name}: its definition contains itself") from None
 
 
 def known(type_name: str, types: Typestore) -> Typestore:
@@ -174,7 +179,36 @@ def known(type_name: str, types: Typestore) -> Typestore:
         CodecError: if it is not.
     """
     if type_name not in types.fielddefs and type_name in MESSAGE_TYPES:
+        _check(types, MESSAGE_TYPES[type_name])
         define(types, type_name, MESSAGE_TYPES[type_name].definition)
     if type_name not in types.fielddefs:
         raise CodecError(f"{type_name}: this message type is not defined")
     return types
+
+
+def _check(store: Typestore, message: type[Message]) -> None:
+    """Check the definition of a plugin's type: what it does not name would be lost from recordings.
+
+    Raises:
+        CodecError: if it is none, has other fields than the class, or changes a type that is defined already.
+    """
+    name, text = message.ros_type, message.definition
+    if not isinstance(text, str) or not text.strip():
+        raise CodecError(f"{name}: its class has no definition: give it the text of the .msg file, definition=…")
+    types = parse_definition(name, text)
+    for other, (_, described) in types.items():
+        if other in store.fielddefs and store.fielddefs[other][1] != described:
+            raise CodecError(f"{name}: its definition has other fields of {other} than those that are known")
+    described = {core_name(field, desc) for field, desc in types[name][1]}
+    has = {field.name for field in attrs.fields(message)}
+    if described != has:
+        more = [f"the class lacks {', '.join(sorted(described - has))}"] * bool(described - has)
+        more += [f"the definition lacks {', '.join(sorted(has - described))}"] * bool(has - described)
+        raise CodecError(f"{name}: its class and its definition have different fields: {'; '.join(more)}")
+
+
+def core_name(name: str, desc: Any) -> str:
+    """The name of a field in core's class of a message: times are `…_ns`."""
+    kind, inner = desc
+    named = inner[0] if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else desc
+    return f"{name}_ns" if named[0] == Nodetype.NAME and named[1] in TIMES else normalize_fieldname(name)

@@ -259,3 +259,51 @@ def test_all_parts_of_messages_are_core_classes():
     from ibrobot_ros2.convert import _PARTS
 
     assert parts - set(MESSAGE_TYPES.values()) - {Message} == set(_PARTS.values())
+
+
+HEADED = "std_msgs/Header header\n"
+WRONG_DEFINITIONS = {
+    "none": ("", "has no definition"),
+    "only a space": (" \n", "has no definition"),
+    "bytes": (b"float32 force", "has no definition"),
+    "a field less": (HEADED, "the definition lacks force"),
+    "a field more": (f"{HEADED}float32 force\nfloat32 more\n", "the class lacks more"),
+    "another name": (f"{HEADED}float32 farce\n", "the class lacks farce; the definition lacks force"),
+    "a time": (f"{HEADED}builtin_interfaces/Time force\n", "the class lacks force_ns; the definition lacks force"),
+    "itself": (f"{HEADED}skin_msgs/Touch force\n", "contains itself"),
+    "each other": (
+        f"{HEADED}skin_msgs/A force\n{SEPARATOR}\nMSG: skin_msgs/A\nskin_msgs/B b\n"
+        f"{SEPARATOR}\nMSG: skin_msgs/B\nskin_msgs/A a\n",
+        "contains itself",
+    ),
+    "another header": (
+        f"{HEADED}float32 force\n{SEPARATOR}\nMSG: std_msgs/Header\nint32 evil\n",
+        "has other fields of std_msgs/msg/Header than those that are known",
+    ),
+    "no type": (f"{HEADED}other_msgs/Thing force\n", "needs 'other_msgs/msg/Thing', which is not defined"),
+    "no definition": ("float32", "its definition cannot be read"),
+}
+
+
+@pytest.mark.parametrize("mistake", WRONG_DEFINITIONS)
+def test_wrong_definition_of_a_plugin_is_named_before_anything_is_recorded(mistake, monkeypatch):
+    """What the definition lacks would be lost, and what it changes would be changed for every other message."""
+    text, reason = WRONG_DEFINITIONS[mistake]
+    name = f"skin_msgs/msg/Touch{list(WRONG_DEFINITIONS).index(mistake)}"
+    text = text.replace("skin_msgs/Touch ", f"skin_msgs/{name.rpartition('/')[2]} ") if isinstance(text, str) else text
+    fields = {"header": attrs.field(default=Header()), "force": attrs.field(default=0.5)}
+    touch: Any = attrs.make_class(
+        "Touch", fields, bases=(Message,), class_body={"ros_type": name, "definition": text}, frozen=True
+    )
+    monkeypatch.setitem(MESSAGE_TYPES._own, name, touch)
+    for _ in range(2):  # the same again: a refused definition leaves nothing behind
+        with pytest.raises(CodecError, match=re.escape(reason)):
+            encode(touch())
+    assert decode("std_msgs/msg/Int32", encode(Int32(3))) == Int32(3)
+    assert type_hash("std_msgs/msg/Header") == get_typestore(Stores.ROS2_JAZZY).hash_rihs01("std_msgs/msg/Header")
+
+
+def test_bag_whose_definition_contains_itself_is_one_error():
+    codec = Codec({"odd_msgs/msg/Odd": "odd_msgs/Odd it\n"})
+    with pytest.raises(CodecError, match="odd_msgs/msg/Odd: its definition contains itself"):
+        codec.decode("odd_msgs/msg/Odd", b"\x00\x01\x00\x00")
