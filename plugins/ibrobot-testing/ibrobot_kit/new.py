@@ -20,7 +20,8 @@ from ibrobot_kit.excerpt import excerpt
 
 FAKES = {
     "hardware": "control:FakeRealHardware",
-    "sensor": "host:FakeSensor",
+    "camera": "host:FakeSensor",
+    "sensor": "host:FakeImu",
     "teleop": "host:FakeTeleop",
     "policy": "host:FakePolicy",
     "engine": "host:FakeEngine",
@@ -29,7 +30,9 @@ FAKES = {
     "transport": "transport:FakeTransport",
     "viewer": "host:FakeViewer",
 }
-"""Kind -> the fake from which its package begins: the smallest implementation that passes the suite of the kind."""
+"""Kind, or `camera` for a sensor of pictures -> the fake from which its package begins.
+
+It is the smallest implementation that passes the suite of the kind."""
 FILES = {
     "pyproject.toml": "pyproject.toml",
     "README.md": "README.md",
@@ -50,7 +53,7 @@ class NewPlugin:
     YAML that runs. Change what it does, and keep its tests green.
     """
 
-    kind: str = option(typed="KIND", choices=tuple(FAKES), help="the kind of the plugin")
+    kind: str = option(typed="KIND", choices=tuple(FAKES), help="the kind of the plugin; camera: a sensor of pictures")
     name: str = option(typed="NAME", help="the type in robot YAMLs, e.g. my_arm")
     out: Path = option(Path(), typed="--out FOLDER", help="the folder in which the package lands")
 
@@ -98,6 +101,7 @@ def render(kind: str, name: str) -> dict[str, str]:
     ):
         body = body.replace(old, new)
     options = [*_options(getattr(module, fake))]
+    interface = "sensor" if kind == "camera" else kind
     context = ["ctx"] if "self, ctx: Context" in body[body.index(f"class {title}(") :] else []
     facts = {
         "kind": kind,
@@ -108,9 +112,9 @@ def render(kind: str, name: str) -> dict[str, str]:
         "options": options,
         "module": f"ibrobot_{name}",
         "package": f"ibrobot-plugin-{name.replace('_', '-')}",
-        "hook": installed_plugins().all_kinds[kind],
-        "descriptor": f"{kind.capitalize()}Descriptor",
-        "suite": f"{kind.capitalize()}Suite",
+        "hook": installed_plugins().all_kinds[interface],
+        "descriptor": f"{interface.capitalize()}Descriptor",
+        "suite": f"{interface.capitalize()}Suite",
         "arguments": ", ".join([*context, *(f"{each['name']}=options.{each['name']}" for each in options)]),
         "summary": (getattr(module, fake).__doc__ or "").partition("\n")[0].rstrip(".").replace("`", ""),
     }

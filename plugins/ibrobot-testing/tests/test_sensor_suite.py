@@ -9,7 +9,7 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_testing import SensorSuite, checks, failed_checks
-from ibrobot_testing.fakes import FakeSensor
+from ibrobot_testing.fakes import FakeImu, FakeSensor
 
 from ibrobot_core.api import CameraInfo, CompressedImage, Header, SensorError
 
@@ -20,6 +20,14 @@ class TestSensor(SensorSuite):
     @override
     def make(self, ctx):
         return FakeSensor(ctx)
+
+
+class TestImu(SensorSuite):
+    timeout_s = 5.0
+
+    @override
+    def make(self, ctx):
+        return FakeImu(ctx)
 
 
 class RelativeTopic(FakeSensor):

@@ -3,6 +3,7 @@
 from ibrobot_testing.fakes.control import FakeExecutor, FakeHardware, FakeRealHardware, FakeTrajectoryExecutor
 from ibrobot_testing.fakes.host import (
     FakeEngine,
+    FakeImu,
     FakePolicy,
     FakeSensor,
     FakeSource,
@@ -16,6 +17,7 @@ __all__ = [
     "FakeEngine",
     "FakeExecutor",
     "FakeHardware",
+    "FakeImu",
     "FakePolicy",
     "FakeRealHardware",
     "FakeRecorder",

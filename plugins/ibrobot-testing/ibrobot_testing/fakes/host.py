@@ -13,6 +13,7 @@ from ibrobot_core.api import (
     Frame,
     Header,
     Image,
+    Imu,
     JointReading,
     Message,
     OperatorEvent,
@@ -24,6 +25,7 @@ from ibrobot_core.api import (
     TeleopCommand,
     TeleopError,
     Tensors,
+    Vector3,
     Viewer,
     seconds,
 )
@@ -64,6 +66,43 @@ class FakeSensor(Sensor):
         height, width = self._size
         pixels = np.full(height * width * 3, stamp_ns // 1_000_000 % 256, np.uint8)
         return Image(Header(stamp_ns, self._ctx.name), height, width, "rgb8", 3 * width, pixels)
+
+    @override
+    def close(self) -> None:
+        self._open = False
+
+
+class FakeImu(Sensor):
+    """An inertial sensor that measures at every control period of the clock.
+
+    Args:
+        ctx: provides the clock.
+        turning: angular velocity about z [rad/s].
+    """
+
+    message_type: type[Message] = Imu
+
+    def __init__(self, ctx: Context, turning: float = 0.5) -> None:
+        self.topic = f"/fake/{ctx.name}/imu"
+        self._ctx = ctx
+        self._turning = turning
+        self._open = False
+        self._last_ns = -1
+
+    @override
+    def open(self) -> None:
+        self._open = True
+
+    @override
+    def read(self, timeout_s: float) -> Imu | None:
+        if not self._open:
+            raise SensorError(f"{self._ctx.name} is not open")
+        now_ns = self._ctx.clock.now_ns()
+        stamp_ns = now_ns - now_ns % self._ctx.period_ns
+        if stamp_ns == self._last_ns:
+            return None
+        self._last_ns = stamp_ns
+        return Imu(Header(stamp_ns, self._ctx.name), angular_velocity=Vector3(0.0, 0.0, self._turning))
 
     @override
     def close(self) -> None:
