@@ -16,7 +16,7 @@ from typing import Any
 from ibrobot_ros2.services import plain
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import RunView
+from ibrobot_core.app import RunView, error_text
 
 SERVICES = ("/agent/arm", "/agent/disarm", "/agent/status")
 _LARGEST = 64 * 1024
@@ -27,12 +27,14 @@ def sockets_folder() -> Path:
     """The folder of the sockets, which only this user may enter.
 
     Raises:
-        IbrobotError: if another user owns it.
+        IbrobotError: if another user owns it, or it is a link, which another user may have made.
     """
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     folder = Path(runtime) / "ibrobot" if runtime else Path(tempfile.gettempdir()) / f"ibrobot-{os.getuid()}"
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    status = folder.stat()
+    status = folder.lstat()
+    if stat.S_ISLNK(status.st_mode):
+        raise IbrobotError(f"{folder} is a link: remove it, or set XDG_RUNTIME_DIR")
     if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
         raise IbrobotError(f"{folder}: other users may enter it: chmod 700 {folder}, or set XDG_RUNTIME_DIR")
     return folder
@@ -69,7 +71,7 @@ class Persons:
                 connection, _ = self._socket.accept()
             except OSError:  # closed
                 return
-            with connection, contextlib.suppress(OSError, ValueError):
+            with connection, contextlib.suppress(OSError, ValueError, RecursionError):
                 connection.settimeout(_TIMEOUT_S)
                 connection.sendall(json.dumps(self._answer(json.loads(_received(connection)))).encode())
 
@@ -80,18 +82,28 @@ class Persons:
             return {"answer": plain(self._session.bus.call(request["service"], request.get("request")))}
         except IbrobotError as error:
             return {"error": str(error)}
+        except Exception as error:
+            self._session.log.exception("%s failed", request["service"])
+            return {"error": f"{request['service']} failed: {error_text(error)}; please report it"}
 
 
-def running() -> Iterator[Path]:
-    """The sockets of the robots that run here."""
+def running(timeout_s: float = _TIMEOUT_S) -> Iterator[Path]:
+    """The sockets of the robots that run here; those of killed runs are removed.
+
+    Args:
+        timeout_s: longest wait for a run that is busy [s].
+    """
     for path in sorted(each for each in sockets_folder().iterdir() if each.is_socket()):
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+            probe.settimeout(timeout_s)
             try:
                 probe.connect(str(path))
-            except OSError:  # of a run that was killed
+            except ConnectionRefusedError:  # of a run that was killed
                 path.unlink(missing_ok=True)
-            else:
-                yield path
+                continue
+            except OSError:  # it is busy, or has just ended
+                pass
+        yield path
 
 
 def ask(path: Path, service: str, request: Any = None) -> Any:

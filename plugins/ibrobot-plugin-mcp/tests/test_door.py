@@ -257,6 +257,67 @@ def test_folder_that_others_may_enter_is_refused(folders: Path) -> None:
         sockets_folder()
 
 
+def test_nothing_but_sockets_of_killed_runs_is_removed_from_the_folder(folders: Path) -> None:
+    folder = sockets_folder()
+    kept = [folder / "notes.txt", folder / "folder", folder / "link"]
+    kept[0].write_text("mine")
+    kept[1].mkdir()
+    kept[2].symlink_to(kept[0])
+    assert list(running()) == []
+    assert all(each.exists() for each in kept)
+
+
+def test_folder_that_another_place_stands_for_is_refused(folders: Path) -> None:
+    (folders / "keys").mkdir(mode=0o700)
+    (folders / "ibrobot").symlink_to(folders / "keys")
+    with pytest.raises(IbrobotError, match="is a link"):
+        sockets_folder()
+
+
+def test_socket_of_a_run_that_is_busy_stays(folders: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as busy:
+        busy.bind(str(sockets_folder() / "busy.1"))
+        busy.listen(0)
+        with contextlib.ExitStack() as stack:
+            for _ in range(3):
+                waiting = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
+                waiting.setblocking(False)
+                with contextlib.suppress(BlockingIOError):
+                    waiting.connect(str(sockets_folder() / "busy.1"))
+            assert [each.name for each in running(0.05)] == ["busy.1"]
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        "[" * 60_000,
+        '{"service": ' * 5_000,
+        "null",
+        "[]",
+        "NaN",
+        '{"service": ["/agent/arm"]}',
+        '{"service": "/agent/arm", "request": 3}',
+        '{"service": "/agent/arm", "request": {"seconds": NaN, "services": ["/x"]}}',
+        '{"service": "/agent/arm", "request": {"seconds": 1e999, "services": ["/x"]}}',
+        '{"service": "/agent/arm", "request": {"seconds": "60", "services": "/x"}}',
+        '{"service": "/agent/arm", "request": {"seconds": 60, "services": ["/x"], "region": {"a": [[NaN, 1]]}}}',
+        '{"service": "/agent/arm", "request": {"seconds": 60, "services": [], "agent": "\\ud800"}}',
+        "\x00\xff",
+    ],
+)
+def test_persons_are_heard_after_any_request(door: AgentDoor, request_: str) -> None:
+    (path,) = running()
+    agent = authority_of(door.session).join("claude")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as garbage:
+        garbage.connect(str(path))
+        garbage.sendall(request_.encode("latin-1"))
+        garbage.shutdown(socket.SHUT_WR)
+        with contextlib.suppress(OSError):
+            garbage.recv(1000)
+    assert ask(path, "/agent/status")["armed"] == ""
+    authority_of(door.session).leave(agent)
+
+
 def test_log_is_a_line_for_each_event(door: AgentDoor, folders: Path) -> None:
     agent = authority_of(door.session).join('x"\n{"event": "forged"}')
     with pytest.raises(IbrobotError):
