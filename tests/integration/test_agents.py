@@ -17,6 +17,7 @@ from typing import Any
 import hostile_agents
 import pytest
 from ibrobot_mcp.door import AgentDoor
+from ibrobot_mcp.resources import Resources
 from ibrobot_mcp.stdio import Pipes
 from mcp import Client, StdioServerParameters
 
@@ -335,3 +336,14 @@ def test_scripted_agent_does_ten_tasks_of_increasing_length(tmp_path: Path, mode
     (log,) = (tmp_path / "ibrobot" / "agents").iterdir()
     events = [json.loads(line)["event"] for line in log.read_text().splitlines()]
     assert re.fullmatch(r"joined armed( called)+ left ended", " ".join(events))
+
+
+def test_agents_read_the_robot_without_its_secrets(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AGENT_TOKEN", "hunter2-hunter2-hunter2")
+    config = load_config(
+        CONFIGS / "so101_blind.yaml", sim=True, overrides=("mcp.token=${AGENT_TOKEN}",), registry=installed_plugins()
+    )
+    assert config.plugin_sections["mcp"].options.token == "hunter2-hunter2-hunter2"
+    text = Resources(Session(config, installed_plugins(), LaunchRequest(lockstep=True))).read("ibrobot://robot")[1]
+    assert "hunter2" not in text
+    assert "shoulder_pan" in text
