@@ -163,6 +163,14 @@ def test_goal_that_was_planned_when_the_authority_ended_does_not_run(run: AgentR
     assert run.moved(100) == 0.0
 
 
+def test_no_goal_passes_before_the_joints_have_braked(run: AgentRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    run.grant()
+    monkeypatch.setattr(run.session, "hold", lambda: None)  # it waits, e.g. for a mode that is entered
+    run.authority.end("disarmed")
+    run.session.bus.call(GO_TO, AWAY)
+    assert run.moved(100) == 0.0
+
+
 def test_person_goes_on_by_entering_the_mode_and_is_not_limited(run: AgentRun) -> None:
     run.grant(speed=0.1)
     run.go()
