@@ -66,7 +66,7 @@ class Scan(OnChannel):
     def __call__(self) -> None:
         rows, unusable = [], 0
         with self.opened() as bus:
-            bus.retries = 0  # most ids have no motor
+            bus.retries = 2  # a lost answer hides no motor, though most ids have none
             for motor in range(1, self.last + 1):
                 try:
                     if not _is_there(bus, motor, must=False):

@@ -40,12 +40,20 @@ class DamiaoOptions:
     )
     motors: Mapping[str, MotorOptions] = option(help="joint -> id, kp, kd, inverted and zero of its motor")
     interface: str = option("", help="interface type of python-can; by default socketcan, or slcan for a serial port")
-    bitrate: int = option(DEFAULT_BITRATE, unit="bit/s", gt=0, help="rate of the bus; socketcan takes it from ip link")
-    data_bitrate: int | None = option(
-        None, unit="bit/s", gt=0, help="rate of the data in CAN FD frames; without it, frames are classic ones"
+    bitrate: int = option(
+        DEFAULT_BITRATE, unit="bit/s", gt=0, le=8_000_000, help="rate of the bus; socketcan takes it from ip link"
     )
-    lost_replies: int = option(3, unit="ticks", ge=0, help="consecutive replies of a motor that may be missing")
-    retries: int = option(2, ge=0, help="retries of requests outside the control loop")
+    data_bitrate: int | None = option(
+        None,
+        unit="bit/s",
+        gt=0,
+        le=8_000_000,
+        help="rate of the data in CAN FD frames; without it, frames are classic ones",
+    )
+    lost_replies: int = option(
+        3, unit="ticks", ge=0, le=1000, help="consecutive replies of a motor that may be missing"
+    )
+    retries: int = option(2, ge=0, le=100, help="retries of requests outside the control loop")
     warning_temperature: float = option(70.0, unit="deg C", gt=0, le=150, help="a motor above it causes a warning")
     max_temperature: float = option(90.0, unit="deg C", gt=0, le=150, help="a motor above it causes a fault")
 

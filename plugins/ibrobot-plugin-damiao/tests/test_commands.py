@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import socket
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from ibrobot_damiao import bus
 from ibrobot_damiao.bus import Channel, DamiaoBus
 from ibrobot_damiao.emulator import EmulatedMotor, EmulatedMotors
 from ibrobot_damiao.emulator.serve import SlcanServer
+from ibrobot_testing import ibrobot_command
 from ibrobot_testing.command import command_line
 
 from ibrobot_core.api import HardwareError, IbrobotError
@@ -70,6 +72,43 @@ def test_scan_lists_the_motors_with_their_state(adapter: SlcanServer) -> None:
     assert code == 0
     assert [line.split(":")[0] for line in screen.splitlines()] == ["motor 1", "motor 2", "motor 5"]
     assert "feedback id 0x12, torque over-temperature of the driver" in screen
+
+
+def test_scan_lists_a_motor_whose_first_answer_is_lost(adapter: SlcanServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    receive, seen = EmulatedMotor.receive, set()
+
+    def losing(motor: EmulatedMotor, arbitration_id: int, data: bytes, now_s: float) -> list[Any]:
+        answers = [*receive(motor, arbitration_id, data, now_s)]
+        first = bool(answers) and (arbitration_id, data) not in seen
+        seen.add((arbitration_id, data))
+        return [] if first else answers
+
+    monkeypatch.setattr(EmulatedMotor, "receive", losing)
+    code, screen = ran("scan", adapter.channel, "--last", "2")
+    assert code == 0
+    assert [line.split(":")[0] for line in screen.splitlines()] == ["motor 1", "motor 2"]
+
+
+@pytest.mark.integration
+def test_preflight_names_what_holds_torque(adapter: SlcanServer, tmp_path: Path) -> None:
+    """It switches the torque on, so that the arm keeps its pose, and says how to switch it off."""
+    robot = config(tmp_path, adapter.channel, lost_replies=1000)
+    contract = {
+        "rate_hz": 30,
+        "observations": [{"key": "observation.state", "topic": "/joint_states"}],
+        "actions": [{"key": "action", "executor": "joints", "topic": "/joints/commands"}],
+    }
+    robot.write_text(robot.read_text() + yaml.safe_dump({"contract": contract}))
+    patient = ("--seconds", "0.5", "--set", "control.state_timeout=60")
+    done = subprocess.run(
+        [*ibrobot_command(), "preflight", str(robot), *patient],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert f"{adapter.channel} holds torque; to take it off: ibrobot damiao off {adapter.channel} --id 1" in done.stderr
+    assert done.returncode == 0
 
 
 def test_scan_of_an_empty_bus_says_what_to_check(adapter: SlcanServer) -> None:

@@ -16,6 +16,7 @@ from ibrobot_core.app import (
     RunView,
     Session,
     SourceWorker,
+    echo,
     installed_plugins,
 )
 from ibrobot_diagnose.cause import DEVICE_POSE
@@ -36,7 +37,7 @@ def look(
     config: RobotConfig, seconds: float, *, lockstep: bool = False, seed: int = 0,
     tell: Callable[[str], None] = lambda what: None,
 ) -> LiveWindow:  # fmt: skip
-    """Look at a rig for some seconds; nothing moves.
+    """Look at a rig for some seconds; nothing moves. What holds torque in the end is on stderr, with its remedy.
 
     Args:
         config: the robot.
@@ -61,6 +62,8 @@ def look(
     finally:
         watch.close()
         runtime.stop()
+        for line in runtime.session.outcome.holding:
+            echo(line, err=True)
     runtime.raise_failure()
     return seen
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @attrs.frozen(kw_only=True)
 class Preflight(PreflightOptions):
-    """Look at a ROBOT at rest, and say what differs from a reference; nothing moves.
+    """Look at a ROBOT at rest, and say what differs from a reference; nothing moves, but its arms hold their pose.
 
     Each line has a number, the numbers from which it warns and fails, and what to do. --take writes the reference: a
     still of each camera with the pose of the arm, rates, calibration and versions. Datasets and checkpoints have one,
