@@ -214,8 +214,12 @@ class AgentServer:
 
 
 def _key(ctx: Any) -> str:
-    """What tells the clients of a transport apart: the session of HTTP; empty for standard input, and without one."""
-    return http_key(ctx.request.headers.get("mcp-session-id", "")) if ctx.request is not None else ""
+    """What tells clients apart: the session of HTTP, without one the client's name; empty for standard input."""
+    if ctx.request is None:
+        return ""
+    if (session := ctx.request.headers.get("mcp-session-id", "")) or ctx.session.client_params is None:
+        return http_key(session)
+    return http_key(f"of {ctx.session.client_params.client_info.name}")
 
 
 def http_key(session: str) -> str:

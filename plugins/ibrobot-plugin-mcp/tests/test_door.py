@@ -25,6 +25,7 @@ from ibrobot_mcp.stdio import Pipes, serve_pipes
 from ibrobot_testing import SectionSuite, check_descriptor, make_session, stand_in
 from mcp import Client
 from mcp.client.streamable_http import streamable_http_client
+from mcp_types import Implementation
 
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import SET_MODE, Component, RequestError, Session
@@ -110,6 +111,27 @@ def test_agent_over_http(door: AgentDoor, mode: str) -> None:
             assert state.structured_content["authority"]["agents"] == ["1:mcp"]
 
     asyncio.run(talk())
+
+
+@pytest.mark.parametrize("mode", ["auto", "legacy"])
+def test_agents_of_two_programs_over_http_are_two(door: AgentDoor, mode: str) -> None:
+    async def talk(name: str) -> Any:
+        async with (
+            httpx2.AsyncClient(headers={"Authorization": f"Bearer {TOKEN}"}) as http,
+            Client(
+                streamable_http_client(door.url, http_client=http),
+                mode=mode,
+                client_info=Implementation(name=name, version="1"),
+            ) as client,
+        ):
+            await client.list_tools()
+            return (await client.call_tool("state", {})).structured_content["authority"]["agents"]
+
+    async def both() -> Any:
+        await talk("first")
+        return await talk("second")
+
+    assert "2:second" in asyncio.run(both())
 
 
 def test_large_request_is_refused(door: AgentDoor) -> None:
