@@ -59,7 +59,8 @@ class Preflight:
             return f"{robot}: {told}; there is no reference to compare with."
         says = {"ok": "is as in the reference", "warn": "is not as in the reference", "fail": "is not fit to be used"}
         taken = f" of {self.card.rig.taken}" if self.card.rig.taken and self.verdict != "fail" else ""
-        return f"{robot} {says[self.verdict]}{taken}: {told}."
+        doubt = ", as far as that is certain" if self.verdict == "ok" and counts["cannot tell"] else ""
+        return f"{robot} {says[self.verdict]}{taken}{doubt}: {told}."
 
     def facts(self) -> dict[str, Any]:
         """The result as a JSON object."""

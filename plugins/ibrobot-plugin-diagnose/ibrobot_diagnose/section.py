@@ -57,7 +57,14 @@ class RigCheck(Component):
 
     @override
     def start(self) -> None:
-        if self._options.action == "off" or (self._against is None and self._takes is None):
+        if self._options.action == "off":
+            return
+        if self._against is None and self._takes is None:
+            if self._asked:
+                self._session.log.warning(
+                    "preflight: there is no reference, so the rig is not compared; take one with `ibrobot preflight "
+                    "ROBOT --take FILE`, and name it in `against`"
+                )
             return
         if self._session.request.lockstep:
             self._session.log.info("preflight: simulated time has not begun; nothing is compared")

@@ -72,6 +72,7 @@ def test_camera_that_the_reference_lacks_is_uncertain(reference, tmp_path):
     code, facts = preflight("--against", less)
     assert (code, unwell(facts)["camera_unknown"]) == (0, "cannot tell")
     assert any(line.startswith("?     camera_unknown: top: not in the reference") for line in facts["lines_of_text"])
+    assert ", as far as that is certain: 0 fail, 0 warn, " in facts["first"]
 
 
 def test_camera_that_moved_fails_with_a_report(reference, tmp_path):

@@ -33,6 +33,17 @@ def test_descriptor_is_complete():
     assert (component.name, component.summary) == ("preflight", "off")
 
 
+@pytest.mark.parametrize("action", ["warn", "refuse"])
+def test_section_without_a_reference_warns_that_nothing_is_compared(action, caplog):
+    RigCheck(PreflightSection(action=action), make_session()).start()
+    (record,) = caplog.records
+    assert record.getMessage().startswith("preflight: there is no reference, so the rig is not compared; take one")
+    caplog.clear()
+    RigCheck(PreflightSection(action="off"), make_session()).start()
+    RigCheck(None, make_session()).start()
+    assert not caplog.records
+
+
 RECORDED = ("recording={type: mcap, root: episodes}",)
 
 
