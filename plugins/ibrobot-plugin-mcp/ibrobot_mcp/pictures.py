@@ -55,7 +55,9 @@ def look(session: RunView, camera: str, timeout_s: float) -> list[Sight]:
     if camera and camera not in known:
         raise SensorError(f"no camera {camera[:80]!r} sends pictures; these do: {', '.join(known) or 'none'}")
     if not known:
-        raise SensorError("no camera sends pictures")
+        there = [name for name, each in session.config.peripherals.items() if each.kind == "camera"]
+        has = f"its cameras are {', '.join(there)}, and none sends pictures" if there else "the robot has no camera"
+        raise SensorError(f"{has}; `state` and `world` show the rest")
     with ExitStack() as stack:
         moving = _subscribed(stack, session, "/tf", _TRANSFORMS)
         wanted = {name: topic for name, topic in known.items() if camera in ("", name)}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from contextvars import copy_context
@@ -164,7 +164,7 @@ class AgentServer:
         except Exception as error:
             self._run.log.exception("tool %s failed", params.name[:80])
             return _failed(f"the tool failed: {error_text(error)}; that is a fault of the robot's program")
-        return types.CallToolResult(content=content, structured_content=structured)
+        return types.CallToolResult(content=content, structured_content=structured, is_error=has_failed(structured))
 
     async def _carried_out[T](self, client: Client, call: Callable[[], T], threads: ThreadPoolExecutor) -> T:
         """Carry out a call in a thread. One that has begun keeps its thread, even if its client cancels it."""
@@ -225,6 +225,12 @@ def _key(ctx: Any) -> str:
 def http_key(session: str) -> str:
     """What tells a client of HTTP apart, none of which is that of standard input, whatever session it names."""
     return f"http {session}"
+
+
+def has_failed(answer: Any) -> bool:
+    """Whether an answer has the result of something that did not succeed, e.g. of a motion that was stopped."""
+    result = answer.get("result") if isinstance(answer, Mapping) else None
+    return isinstance(result, Mapping) and result.get("success") is False
 
 
 def _failed(why: str) -> types.CallToolResult:

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from ibrobot_mcp.server import http_key
+from ibrobot_mcp.server import has_failed, http_key
 from mcp import Client, MCPError
 
 from .conftest import STATE, Rig
@@ -77,6 +77,7 @@ def test_granted_motion_answers_with_its_result(rig: Rig, mode: str) -> None:
         ("test_move", {"to": 0, "fsat": 1}, "fsat: unknown key"),
         ("wait", {"tool": "state", "number": 1}, "'state' answers with no number; these do: test_move"),
         ("look", {"camera": "top"}, "no camera 'top' sends pictures; these do: none"),
+        ("look", {}, "the robot has no camera; `state` and `world` show the rest"),
         ("test_forget", {}, "there is no tool 'test_forget' in this mode; the tools are: authority, "),
         ("no\x1b[31m tool", {}, "there is no tool"),
     ],
@@ -91,6 +92,21 @@ def test_errors_say_what_would_be_right(rig: Rig, tool: str, arguments: Any, why
 
     rig.talk(act)
     assert not any(isinstance(each, float) for each in rig.moves)
+
+
+@pytest.mark.parametrize(
+    ("answer", "failed"),
+    [
+        ({"number": 2, "result": {"success": False, "outcome": "CANCELLED"}}, True),
+        ({"number": 2, "result": {"success": True}}, False),
+        ({"number": 2, "result": None, "next": "it is under way"}, False),
+        ({"number": 2, "result": "ended"}, False),
+        ({"answer": {"success": False}}, False),
+        ([1], False),
+    ],
+)
+def test_a_motion_that_did_not_succeed_is_an_error_to_the_agent(answer: Any, failed: bool) -> None:
+    assert has_failed(answer) is failed
 
 
 def test_agent_that_calls_too_often_is_refused_and_may_still_stop(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
