@@ -208,6 +208,13 @@ CLAIMS = (
         "datasets_check.py",
     ),
     Claim(
+        "preflight",
+        "`ibrobot preflight` finds a camera that moved by 20 pixels or 3 degrees, or says that it cannot tell, whatever"
+        " the arm, the light and the objects do, and accuses none of 60 rigs that are as they were",
+        "docs/how-to/check-a-rig.md",
+        "preflight.py --unchanged 60 --each 1",
+    ),
+    Claim(
         "server_kill",
         "the arm holds while its server is dead, and continues within 1 s of the restart",
         "docs/how-to/serve.md",
