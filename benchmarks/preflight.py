@@ -175,7 +175,10 @@ def by_chance(table: str, place: str, number: int, *, at_rest: bool | None = Non
     low, high = np.array([-1.2, -1.6, -0.6, -1.0, -1.5, 0.0]), np.array([1.2, 0.2, 1.5, 1.0, 1.5, 1.2])
     pose = REST if rests else tuple(float(f"{each:.4g}") for each in rng.uniform(low, high))
     light, distractors = float(rng.uniform(0.9, 1.1)), int(rng.integers(0, 4))
-    return Setup(table=table, place=place, seed=number, light=light, pose=pose, distractors=distractors)
+    setup = Setup(table=table, place=place, seed=number, light=light, pose=pose, distractors=distractors)
+    if not rests and seen(setup).rig.conditions:  # the pose is in the table, which throws the arm out of it
+        return by_chance(table, place, number + 1_000_000, at_rest=at_rest)
+    return setup
 
 
 def planted(table: str, place: str, number: int) -> Iterator[tuple[str, str, LiveWindow]]:

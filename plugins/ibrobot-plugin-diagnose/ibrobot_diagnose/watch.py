@@ -115,9 +115,10 @@ def _described(rig: Rig | None, session: RunView, infos: Mapping[str, CameraInfo
     if rig is None:
         raise HardwareError("there is nothing to compare: the contract has no joints")
     cameras = {key: attrs.evolve(camera, focal=_focal(infos.get(key))) for key, camera in rig.cameras.items()}
+    faults = ({"message": fault, "severity": "fault"} for fault in session.faults)
     return attrs.evolve(
         rig, taken=datetime.now(UTC).isoformat(timespec="seconds"), cameras=cameras,
-        loop_hz=None if session.request.lockstep else rig.loop_hz, conditions=tuple(map(dict, session.conditions)),
+        loop_hz=None if session.request.lockstep else rig.loop_hz, conditions=(*faults, *map(dict, session.conditions)),
         absent={each.name: str(each.missing) for each in session.absent},
     )  # fmt: skip
 

@@ -359,7 +359,7 @@ class LeaderApart(RigCause):
 class JointsUnwell(Cause):
     """Servos report abnormal conditions."""
 
-    name, title = "joints_unwell", "no servo is hot, overloaded or short of voltage"
+    name, title = "joints_unwell", "there is no fault, and no servo is hot, overloaded or short of voltage"
     needs = frozenset({"rig"})
     explains = frozenset({"loop_slow"})
     remedy = (
