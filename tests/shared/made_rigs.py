@@ -41,6 +41,8 @@ class Scene:
     """Seed of the places of what moves."""
     arm: float = 0.0
     """Where the arm stands [rad]."""
+    width: int = 18
+    """Half of the arm's width [pixels]."""
     noise: int = 1
     made: Callable[[Picture], Picture] = lambda picture: picture
     """What becomes of the picture."""
@@ -72,7 +74,7 @@ class Scene:
         """Where the arm is, with some pixels around it."""
         mask = np.zeros((HEIGHT, WIDTH), np.bool_)
         middle = int(WIDTH * (0.5 + 0.3 * self.arm))
-        mask[60 - room :, max(0, middle - 18 - room) : middle + 18 + room] = True
+        mask[60 - room :, max(0, middle - self.width - room) : middle + self.width + room] = True
         return mask
 
     def still(self, *, masked: bool = True, reads: float | None = None) -> Still:

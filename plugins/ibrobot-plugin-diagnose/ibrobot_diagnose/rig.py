@@ -105,7 +105,7 @@ class Rig:
         if taken := str(facts["taken"]):
             datetime.fromisoformat(taken)
         calibration = {
-            str(name): {str(joint): dict(numbers) for joint, numbers in each.items()}
+            str(name): {str(joint): _numbers(numbers, str(joint)) for joint, numbers in each.items()}
             for name, each in facts["calibration"].items()
         }
         return cls(
@@ -125,6 +125,14 @@ def _finite(value: Any, name: str) -> float:
     if not math.isfinite(number):
         raise ValueError(f"{name}: {value!r} is not a finite number")
     return number
+
+
+def _numbers(numbers: Mapping[str, Any], joint: str) -> dict[str, Any]:
+    """The numbers of a joint's calibration."""
+    for key in ("homing_offset", "range_min", "range_max"):
+        if type(numbers[key]) is not int:
+            raise ValueError(f"calibration: {joint}: {key}: {numbers[key]!r} is not a whole number")
+    return dict(numbers)
 
 
 def _number(value: Any, name: str) -> float | None:

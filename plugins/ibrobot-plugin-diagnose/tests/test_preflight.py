@@ -93,6 +93,14 @@ def test_camera_that_moved_fails_with_a_report(reference, tmp_path):
     assert json.loads((tmp_path / "preflight.json").read_text())["verdict"] == "fail"
 
 
+def test_fault_of_the_run_fails(reference):
+    """The servos fall silent while the rig is looked at."""
+    silent = "simulation.faults=[{at: 0.2, kind: read_error}]"
+    done = run_here("preflight", *SIM, "--against", reference, "--set", silent)
+    assert done.returncode == 1, done.stderr
+    assert "FAIL  joints_unwell: " in done.stdout
+
+
 def test_events_tell_what_is_done(reference):
     done = run_here("preflight", *SIM, "--against", reference, "--events")
     events = [json.loads(line) for line in done.stdout.splitlines()]

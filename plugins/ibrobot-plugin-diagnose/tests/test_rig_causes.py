@@ -65,6 +65,17 @@ def test_turned_camera_is_found(degrees):
     assert f"turned by {degrees:.1f}" in first.evidence.text
 
 
+def test_mask_tells_a_large_arm_from_what_stands_still():
+    """Without it, most of what could be seen is elsewhere."""
+    turned, then = Scene(width=100, arm=0.9, objects=2), Scene(width=100, arm=-0.9)
+    told = [
+        verdicts(*(rig(each.still(masked=masked)) for each in (turned, then))).get("camera_moved")
+        for masked in (True, False)
+    ]
+    assert told[0] is None
+    assert told[1] is not None
+
+
 def test_plain_table_cannot_tell():
     plain = [rig(Scene(plain=True, objects=each, arm=0.8 * each).still()) for each in (0, 1)]
     moved = {each.name: each.evidence for each in compared(plain[1], plain[0]).measured}["camera_moved"]
@@ -152,6 +163,22 @@ def test_what_else_is_wrong_is_found(changes, cause, verdict):
 
 
 @pytest.mark.parametrize(
+    ("numbers", "says"),
+    [
+        ({"homing_offset": -2100}, "an offset of -2100 ticks"), ({"range_min": 3}, "ends where the encoder does"),
+        ({"range_max": 4095}, "ends where the encoder does"), ({"range_min": 3150}, "3150 to 3200 ticks only"),
+        ({"range_min": 0, "range_max": 4095}, None),
+        ({"homing_offset": 2047}, None),
+    ],
+)  # fmt: skip
+def test_odd_calibration_is_named(numbers, says):
+    odd = attrs.evolve(THEN, calibration=changed(**numbers))
+    found = {each.name: each.evidence.text for each in compared(odd, odd).findings}
+    assert ("calibration_odd" in found) == (says is not None)
+    assert says is None or says in found["calibration_odd"]
+
+
+@pytest.mark.parametrize(
     ("camera", "cause"),
     [
         ({"rate_hz": 15.0}, "camera_slow"), ({"size": (240, 320)}, "other_resolution"),
@@ -183,6 +210,9 @@ def damaged(facts):
     for key in facts:
         for value in wrong:
             yield {**facts, key: value}
+    for key in ("homing_offset", "range_min", "range_max"):
+        for value in wrong:
+            yield {**facts, "calibration": changed(**{key: value})}
     camera = facts["cameras"][TOP]
     for key in camera:
         for value in wrong:
@@ -245,7 +275,7 @@ def test_damaged_rigs_are_refused_or_read(tmp_path):
     """Whatever a file says, it is a card that can be compared, or a clear error."""
     whole, file = card(rig(Scene(plain=True).still())).facts(), tmp_path / "card.json"
     siblings = list(damaged(whole["rig"]))
-    assert len(siblings) == 8 * (10 + 6 + 2)
+    assert len(siblings) == 8 * (10 + 3 + 6 + 2)
     refused = 0
     for each in siblings:
         known, error = read(file, {**whole, "rig": each})

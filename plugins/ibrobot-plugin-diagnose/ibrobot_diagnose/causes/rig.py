@@ -242,6 +242,50 @@ class OtherCalibration(RigCause):
         return Evidence(text, worst, "degrees", 0.5, likelihood(worst, 0.5, 2.0), fails=2.0)
 
 
+class CalibrationOdd(Cause):
+    """A calibration has numbers that no servo stores, or a range that passes the end of the encoder."""
+
+    name, title = "calibration_odd", "the calibration has ranges and offsets that servos can have"
+    needs = frozenset({"rig"})
+    explains = frozenset({"zero_shifted"})
+    remedy = (
+        "Calibrate the joint again: begin in the middle of its range, and move it from stop to stop. If its range "
+        "still passes the end of the encoder, turn the servo's horn by half a turn and mount it again."
+    )
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        assert window.rig is not None
+        odd = [
+            f"{joint} {fault}"
+            for joints in window.rig.calibration.values()
+            for joint, numbers in joints.items()
+            for fault in _odd(numbers)
+        ]
+        if not window.rig.calibration:
+            return None
+        number = float(len(odd))
+        text = f"The calibration is odd: {'; '.join(odd)}." if odd else "The calibration has usual numbers."
+        return Evidence(text, number, "joints", 1.0, 0.7 if odd else 0.0)
+
+
+_LAST_TICK, _LARGEST_OFFSET, _NEAR = 4095, 2047, 8
+"""Of an encoder of 4096 ticks; the offset has a sign and 11 bits [ticks]."""
+_NARROW = 200
+"""Ranges below it are hardly those of a joint [ticks]."""
+
+
+def _odd(numbers: Mapping[str, Any]) -> Iterator[str]:
+    low, high, offset = (int(numbers[each]) for each in ("range_min", "range_max", "homing_offset"))
+    if abs(offset) > _LARGEST_OFFSET:
+        yield f"has an offset of {offset} ticks, where servos store {-_LARGEST_OFFSET} to {_LARGEST_OFFSET}"
+    turns_round = (low, high) == (0, _LAST_TICK)
+    if not turns_round and (low <= _NEAR or high >= _LAST_TICK - _NEAR):
+        yield f"has a range of {low} to {high} ticks, which ends where the encoder does: it passes the end there"
+    elif high - low < _NARROW:
+        yield f"has a range of {low} to {high} ticks only"
+
+
 class OtherGripper(RigCause):
     """The gripper has another range."""
 
@@ -420,5 +464,5 @@ class OtherVersions(RigCause):
 
 CAUSES: tuple[type[Cause], ...] = (
     OtherRobot, CameraMissing, CameraUnknown, OtherResolution, CameraSlow, CameraOptions, LoopSlow, OtherCalibration,
-    OtherGripper, ZeroShifted, LeaderApart, JointsUnwell, OtherContract, OtherVersions,
+    CalibrationOdd, OtherGripper, ZeroShifted, LeaderApart, JointsUnwell, OtherContract, OtherVersions,
 )  # fmt: skip
