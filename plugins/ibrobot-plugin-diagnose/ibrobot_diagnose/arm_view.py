@@ -75,6 +75,6 @@ def _drawn(
             for still in camera.stills:
                 pose = np.zeros(len(config.robot.joint_names))
                 pose[at] = still.pose
-                known = bool(np.isfinite(still.pose).all())
-                stills.append(attrs.evolve(still, moving=view.moving(pose) if known else None))
+                is_known = bool(np.isfinite(still.pose).all())
+                stills.append(attrs.evolve(still, moving=view.moving(pose) if is_known else None))
             yield attrs.evolve(camera, stills=tuple(stills), stands=view.stands)
