@@ -449,7 +449,8 @@ class _Plugin:
                 self.double(registry, "command", each.name, registry.command_packages[each.name], "ibrobot_commands")
         for each in offers["ibrobot_messages"]:
             if registry.messages.setdefault(each.type, each) is not each:
-                self.refuse(registry, f"message type {each.type} is defined already", "ibrobot_messages")
+                first = registry.messages[each.type].message.place
+                self.refuse(registry, f"message type {each.type} is defined by {first} already", "ibrobot_messages")
         registry.features |= {each.name: each for each in offers["ibrobot_features"]}
         registry.managers[self.name] = self.manager
 

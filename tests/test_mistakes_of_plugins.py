@@ -127,7 +127,7 @@ def test_two_packages_that_define_one_message_type_are_named(site: Site, tmp_pat
     offer(site, tmp_path, MESSAGE, "fake-skin")
     offer(site, tmp_path, MESSAGE, "other-skin")
     (failure,) = discover(site.entry_points()).failures
-    assert "message type skin_msgs/msg/Touch is defined already" in str(failure)
+    assert "message type skin_msgs/msg/Touch is defined by fake_skin:Touch already" in str(failure)
     assert "(other-skin)" in str(failure)
 
 

@@ -15,7 +15,7 @@ from urllib.parse import unquote, urlsplit
 import attrs
 from packaging.requirements import Requirement
 
-from ibrobot_core.api import Check, Descriptor, Late, option
+from ibrobot_core.api import MESSAGE_TYPES, Check, Descriptor, Late, MessageDescriptor, option
 from ibrobot_core.app import Registry, RequestError, Unsuccessful, echo, installed_plugins
 
 HEAVY = ("av", "cv2", "lerobot", "mujoco", "numpy", "pinocchio", "pyarrow", "scipy", "torch")
@@ -76,6 +76,10 @@ def examine(package: str, registry: Registry) -> Iterator[Check]:
         yield _weight(point.module)
     for entry in entries:
         yield from _described(f"{entry.kind} {entry.descriptor.type}", entry.descriptor)
+    modules = {point.module.partition(".")[0] for point in points}
+    for each in registry.messages.values():
+        if each.message.place.partition(":")[0].partition(".")[0] in modules:
+            yield _message(each)
     yield _tests(installed)
 
 
@@ -126,6 +130,17 @@ def _described(name: str, descriptor: Descriptor[Any]) -> Iterator[Check]:
     lacking = sorted(made.__abstractmethods__) if inspect.isabstract(made) else []
     text = f"{made.__name__} lacks {', '.join(lacking)}" if lacking else f"{descriptor.make.place} is there"
     yield Check(name, not lacking, text, "define these methods")
+
+
+def _message(descriptor: MessageDescriptor) -> Check:
+    """Whether a message type is used, and is one."""
+    name = f"message {descriptor.type}"
+    try:
+        if MESSAGE_TYPES[descriptor.type] is not descriptor.load():
+            return Check(name, False, "core has this type, so that yours is not used", "give it a name of its own")
+    except Exception as error:  # noqa: BLE001 - whatever the plugin raises
+        return Check(name, False, f"{descriptor.message.place}: {error}", "name a class that is derived from Message")
+    return Check(name, True, f"{descriptor.message.place} is there")
 
 
 def _tests(package: Distribution) -> Check:

@@ -141,3 +141,36 @@ def test_tests_of_the_source_are_run(site: Site, tmp_path: Path, monkeypatch: py
 def test_what_is_no_plugin_is_an_error(package: str, message: str) -> None:
     with pytest.raises(RequestError, match=message):
         CheckPlugin(package)()
+
+
+@pytest.mark.parametrize(
+    ("type_", "place", "text"),
+    [
+        ("skin_msgs/msg/Touch", "fake_wave:Touch", "fake_wave:Touch is there"),
+        ("sensor_msgs/msg/JointState", "fake_wave:JointState", "core has this type, so that yours is not used"),
+        ("skin_msgs/msg/Push", "fake_wave:Touch", "fake_wave:Touch is no message of type skin_msgs/msg/Push"),
+        ("skin_msgs/msg/Touch", "fake_wave:Tuch", "fake_wave:Tuch: module 'fake_wave' has no attribute 'Tuch'"),
+    ],
+)
+def test_message_types_are_checked(site: Site, type_: str, place: str, text: str) -> None:
+    messages = f'''
+
+from ibrobot_core.api import Message, MessageDescriptor
+
+
+class Touch(Message, ros_type="skin_msgs/msg/Touch"):
+    pass
+
+
+class JointState(Message, ros_type="sensor_msgs/msg/JointState"):
+    pass
+
+
+@hookimpl
+def ibrobot_messages():
+    yield MessageDescriptor("{type_}", Late("{place}"))
+'''
+    install(site, PLUGIN + messages)
+    check = checks()[f"message {type_}"]
+    assert text in check.found
+    assert check.ok == text.endswith("is there")
