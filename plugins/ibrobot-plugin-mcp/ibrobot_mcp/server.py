@@ -5,20 +5,19 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Awaitable, Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from contextvars import copy_context
 from functools import partial
 from typing import Any
 
 import anyio
+import anyio.to_thread
 import attrs
 import mcp_types as types
 from mcp import MCPError
 from mcp.server.lowlevel.server import Server
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import SET_MODE, Agent, RunView, error_text
+from ibrobot_core.app import SET_MODE, Agent, RequestError, RunView, error_text
 from ibrobot_mcp.audit import authority_of
 from ibrobot_mcp.prompts import PROMPTS, prompt
 from ibrobot_mcp.resources import Resources
@@ -74,8 +73,8 @@ class AgentServer:
         self._resources = Resources(run)
         self._clients: dict[str, Client] = {}
         """Session of the transport, empty where it has none -> the client."""
-        self._calls = ThreadPoolExecutor(_OPEN, "agents' calls")
-        self._stops = ThreadPoolExecutor(2, "agents' stops")
+        self._calls = anyio.CapacityLimiter(_OPEN)
+        self._stops = anyio.CapacityLimiter(2)
         self.protocol: Server[Any] = Server(
             "ibrobot",
             version=run.registry.versions().get("ibrobot-plugin-mcp", ""),
@@ -117,8 +116,6 @@ class AgentServer:
         """Disconnect all clients."""
         for key in tuple(self._clients):
             self.leave(key)
-        for each in (self._calls, self._stops):
-            each.shutdown(wait=False, cancel_futures=True)
 
     async def _heard(self, ctx: Any, call_next: Callable[[Any], Awaitable[Any]]) -> Any:
         """Note a sign of life of a known client."""
@@ -166,13 +163,30 @@ class AgentServer:
             return _failed(f"the tool failed: {error_text(error)}; that is a fault of the robot's program")
         return types.CallToolResult(content=content, structured_content=structured, is_error=has_failed(structured))
 
-    async def _carried_out[T](self, client: Client, call: Callable[[], T], threads: ThreadPoolExecutor) -> T:
-        """Carry out a call in a thread. One that has begun keeps its thread, even if its client cancels it."""
-        waiting = client.waiting_stops if threads is self._stops else client.waiting
+    async def _carried_out[T](self, client: Client, call: Callable[[], T], limiter: anyio.CapacityLimiter) -> T:
+        """Carry out a call in a thread. One that has begun keeps its place, even if its client cancels it."""
+        waiting = client.waiting_stops if limiter is self._stops else client.waiting
         waiting.add(call)
-        future = threads.submit(copy_context().run, call)
-        future.add_done_callback(lambda _: waiting.discard(call))
-        return await asyncio.wrap_future(future)
+        wanted = True
+
+        def unless_cancelled() -> T:
+            if not wanted:
+                raise RequestError("cancelled")
+            return call()
+
+        async def in_thread() -> T:
+            try:
+                return await anyio.to_thread.run_sync(unless_cancelled, limiter=limiter)
+            finally:
+                waiting.discard(call)
+
+        task = asyncio.create_task(in_thread())
+        task.add_done_callback(lambda done: done.cancelled() or done.exception())
+        try:
+            return await asyncio.shield(task)
+        except asyncio.CancelledError:
+            wanted = False
+            raise
 
     def _busy(self, client: Client, urgent: bool = False) -> str:
         """Why a client must wait; empty if it need not."""
