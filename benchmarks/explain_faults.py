@@ -9,8 +9,11 @@ import attrs
 import cv2
 import numpy as np
 from ibrobot_lerobot.policy import LeRobotPolicy
+from ibrobot_mujoco import camera
 from ibrobot_mujoco.camera import MujocoCamera
 from ibrobot_mujoco.hardware import MujocoHardware
+from ibrobot_mujoco.options import CameraOptions
+from mujoco import MjModel
 from numpy.typing import NDArray
 
 from ibrobot_core.errors import PolicyError
@@ -95,34 +98,29 @@ def frozen(seconds: float) -> None:
 
 def moved(by: tuple[float, float]) -> None:
     """A camera that was pushed and turned: [m] and [rad]."""
-    plain = MujocoCamera._find_camera
+    plain = camera.find_camera
 
-    def find(self: MujocoCamera) -> int:
-        number = plain(self)
-        if self._ctx.name == "top":
-            w, x, y, z = self._model.cam_quat[number]
+    def find(model: MjModel, options: CameraOptions, peripheral: str) -> int:
+        number = plain(model, options, peripheral)
+        if peripheral == "top":
+            w, x, y, z = model.cam_quat[number]
             half = by[1] / 2
             c, s = np.cos(half), np.sin(half)  # a turn about the optical axis
-            self._model.cam_quat[number] = (w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s)
-            self._model.cam_pos[number] += (by[0], by[0] / 2, 0.0)
+            model.cam_quat[number] = (w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s)
+            model.cam_pos[number] += (by[0], by[0] / 2, 0.0)
         return number
 
-    MujocoCamera._find_camera = find  # type: ignore[method-assign]
+    camera.find_camera = find
 
 
 def exchanged(strength: object) -> None:
     """Each camera has the other's place."""
-    plain = MujocoCamera._find_camera
+    plain = camera.find_camera
 
-    def find(self: MujocoCamera) -> int:
-        context, other = self._ctx, {"top": "wrist", "wrist": "top"}
-        self._ctx = attrs.evolve(context, name=other[context.name])
-        try:
-            return plain(self)
-        finally:
-            self._ctx = context
+    def find(model: MjModel, options: CameraOptions, peripheral: str) -> int:
+        return plain(model, options, {"top": "wrist", "wrist": "top"}[peripheral])
 
-    MujocoCamera._find_camera = find  # type: ignore[method-assign]
+    camera.find_camera = find
 
 
 def late(seconds: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -135,7 +135,8 @@ def test_message_type_of_a_plugin_is_known_as_those_of_core_are(site: Site, tmp_
     offer(site, tmp_path, MESSAGE, "fake-skin")
     assert "skin_msgs/msg/Touch" in MESSAGE_TYPES
     assert "skin_msgs/msg/Touch" in [*MESSAGE_TYPES]
-    touch = MESSAGE_TYPES["skin_msgs/msg/Touch"](force=0.5)
+    kind: Any = MESSAGE_TYPES["skin_msgs/msg/Touch"]
+    touch = kind(force=0.5)
     assert Selection(touch.ros_type, ["force"])(touch) == 0.5
     with pytest.raises(ContractError, match=r"Touch has no field 'farce'.*did you mean 'force'"):
         Selection(touch.ros_type, ["farce"])

@@ -301,6 +301,15 @@ def test_path_that_leaves_the_region_is_refused_though_both_ends_are_within(run:
     assert run.moved(300) > 0.09
 
 
+@pytest.mark.parametrize(("out", "within"), [(1.5, 0.4), (-0.3, -0.1)])
+def test_gripper_keeps_to_the_region(run: AgentRun, out: float, within: float) -> None:
+    run.grant(region={"position.gripper": ((-0.15, 0.5),)}, speed=1.0)
+    run.go(f"gripper={out}")
+    assert run.moved(200) == 0.0
+    run.go(f"gripper={within}")
+    assert run.moved(200) > 0.09
+
+
 def policy(run: AgentRun, speed: float = 1.0, **more: Any) -> None:
     run.grant(services=("/set_mode",), speed=speed, **more)
     run.authority.call(run.agent, "/set_mode", "model_inference")

@@ -38,12 +38,12 @@ def device() -> Iterator[EmulatedNetFt]:
         count = 0
         while not ended.wait(0.005):
             count += 1
-            device.measure((0, 0, 1000 * count, -count, 0, 0))
+            sensor.measure((0, 0, 1000 * count, -count, 0, 0))
 
-    with EmulatedNetFt() as device:
+    with EmulatedNetFt() as sensor:
         thread = threading.Thread(target=measure)
         thread.start()
-        yield device
+        yield sensor
         ended.set()
         thread.join()
 

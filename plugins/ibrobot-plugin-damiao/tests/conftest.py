@@ -17,7 +17,7 @@ from .memory import MemoryBus
 @pytest.fixture
 def wire(monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryBus.Wire]:
     """Motors 1 to 6 on the channel `arm` of interface type `memory`; `wire.motors` has them."""
-    monkeypatch.setattr(can.util, "VALID_INTERFACES", {*can.util.VALID_INTERFACES, "memory"})
+    monkeypatch.setattr("can.util.VALID_INTERFACES", {*can.VALID_INTERFACES, "memory"})
     monkeypatch.setitem(can.interfaces.BACKENDS, "memory", (MemoryBus.__module__, MemoryBus.__name__))
     motors = EmulatedMotors([EmulatedMotor(motor) for motor in range(1, 7)], SteppedClock(START_NS))
     MemoryBus.wires["arm"] = MemoryBus.Wire(motors)

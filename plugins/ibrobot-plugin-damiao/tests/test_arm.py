@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import override
+from typing import Any, override
 
 import can
 import numpy as np
@@ -33,12 +33,13 @@ from .memory import MemoryBus
 JOINTS = (*ARM, *GRIPPER)
 
 
-def options(**changes: object) -> DamiaoOptions:
+def options(**changes: Any) -> DamiaoOptions:
     """One joint is inverted, one counts from elsewhere."""
     motors = {joint: MotorOptions(id=i, kp=40.0, kd=1.5) for i, joint in enumerate(JOINTS, 1)}
     motors["elbow_flex"] = MotorOptions(id=3, kp=40.0, kd=1.5, inverted=True)
     motors["wrist_flex"] = MotorOptions(id=4, kp=40.0, kd=1.5, zero=-0.4)
-    return DamiaoOptions(**{"channel": "arm", "interface": "memory", "motors": motors, **changes})
+    given: dict[str, Any] = {"channel": "arm", "interface": "memory", "motors": motors, **changes}
+    return DamiaoOptions(**given)
 
 
 class TestDamiaoArm(HardwareSuite):
@@ -61,7 +62,7 @@ class TestDamiaoArm(HardwareSuite):
 
 
 @contextmanager
-def connected(clock: SteppedClock, **changes: object) -> Iterator[DamiaoArm]:
+def connected(clock: SteppedClock, **changes: Any) -> Iterator[DamiaoArm]:
     arm = DamiaoArm(options(**changes), control_context(clock=clock))
     arm.connect()
     try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import override
+from typing import Any, override
 
 import ibrobot_netft
 import pytest
@@ -14,6 +14,7 @@ from ibrobot_netft import NetFtOptions
 from ibrobot_netft.emulator import EmulatedNetFt
 from ibrobot_netft.protocol import START, Record, command_of, request
 from ibrobot_netft.sensor import NetFt
+from ibrobot_sensor_messages.messages import WrenchStamped
 from ibrobot_testing import SensorSuite, check_descriptor
 from ibrobot_testing.contexts import host_context
 
@@ -49,9 +50,10 @@ class TestNetFt(SensorSuite):
 
 
 @contextmanager
-def opened(**changes: object) -> Iterator[tuple[NetFt, EmulatedNetFt]]:
+def opened(**changes: Any) -> Iterator[tuple[NetFt, EmulatedNetFt]]:
     with EmulatedNetFt() as device:
-        options = NetFtOptions(**{"host": "127.0.0.1", "port": device.port, "silence": PATIENCE_S, **changes})
+        given: dict[str, Any] = {"host": "127.0.0.1", "port": device.port, "silence": PATIENCE_S, **changes}
+        options = NetFtOptions(**given)
         sensor = NetFt(options, host_context("wrist"))
         sensor.open()
         try:
@@ -59,6 +61,13 @@ def opened(**changes: object) -> Iterator[tuple[NetFt, EmulatedNetFt]]:
             yield sensor, device
         finally:
             sensor.close()
+
+
+def along_z(sensor: NetFt) -> float:
+    """The next force [N]."""
+    message = sensor.read(PATIENCE_S)
+    assert message is not None
+    return message.wrench.force.z
 
 
 def test_what_the_descriptor_says_is_what_the_sensor_publishes() -> None:
@@ -108,22 +117,22 @@ def test_counts_become_newtons_and_newton_metres() -> None:
 def test_late_double_and_damaged_records_are_left_out() -> None:
     with opened() as (sensor, device):
         device.measure((0, 0, 3_000_000, 0, 0, 0), sequence=3)
-        assert sensor.read(PATIENCE_S).wrench.force.z == 3.0
+        assert along_z(sensor) == 3.0
         device.measure((0, 0, 2_000_000, 0, 0, 0), sequence=2)
         device.measure((0, 0, 3_500_000, 0, 0, 0), sequence=3)
         device.send(b"\x00" * 35)
         device.measure((0, 0, 4_000_000, 0, 0, 0), sequence=4)
-        assert sensor.read(PATIENCE_S).wrench.force.z == 4.0
+        assert along_z(sensor) == 4.0
 
 
 def test_numbers_of_records_may_wrap() -> None:
     with opened() as (sensor, device):
         device.measure((0, 0, 1_000_000, 0, 0, 0), sequence=2**31 - 1)
-        assert sensor.read(PATIENCE_S).wrench.force.z == 1.0
+        assert along_z(sensor) == 1.0
         device.measure((0, 0, 1_500_000, 0, 0, 0), sequence=2**32 - 2)
-        assert sensor.read(PATIENCE_S).wrench.force.z == 1.5
+        assert along_z(sensor) == 1.5
         device.measure((0, 0, 2_000_000, 0, 0, 0), sequence=1)
-        assert sensor.read(PATIENCE_S).wrench.force.z == 2.0
+        assert along_z(sensor) == 2.0
 
 
 def test_wrong_values_are_an_error_until_the_sensor_measures_again() -> None:
@@ -152,7 +161,7 @@ def test_a_sensor_without_power_is_an_error_and_is_asked_again_when_it_is_back()
         assert message.wrench.force.z == 1.0
 
 
-def read_or_none(sensor: NetFt):
+def read_or_none(sensor: NetFt) -> WrenchStamped | None:
     try:
         return sensor.read(PATIENCE_S)
     except SensorError:

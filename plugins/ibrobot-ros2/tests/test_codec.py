@@ -45,21 +45,20 @@ UNSIGNED = (0, 2**32 - 1)
 type_hash("ibrobot_msgs/msg/AudioBlock")  # from here on it is among the standard types
 
 
-def bounds(cls: type, name: str) -> tuple[int, int]:
-    """What an integer field of a type that plugins define can hold, by its definition."""
-    fields = dict(standard_types().fielddefs[cls.ros_type][1])
-    info = np.iinfo(fields[name][1][0])
+def definition_of(cls: Any, name: str) -> Any:
+    """How a field of a type that plugins define is defined, as rosbags has it."""
+    return dict(standard_types().fielddefs[cls.ros_type][1])[name]
+
+
+def bounds(cls: Any, name: str) -> tuple[int, int]:
+    """What an integer field of such a type can hold."""
+    info = np.iinfo(definition_of(cls, name)[1][0])
     return int(info.min), int(info.max)
 
 
-def is_single(cls: type, name: str) -> bool:
-    """Whether a field has single precision."""
-    return dict(standard_types().fielddefs[cls.ros_type][1]).get(name, (0, ("",)))[1][0] == "float32"
-
-
-def length_of(cls: type, name: str) -> int | None:
+def length_of(cls: Any, name: str) -> int | None:
     """Length of an array of such a type; None if it may vary."""
-    kind, (_, length) = dict(standard_types().fielddefs[cls.ros_type][1])[name]
+    kind, (_, length) = definition_of(cls, name)
     return length if kind == Nodetype.ARRAY else None
 
 
@@ -85,10 +84,10 @@ def of_field(cls: type, name: str, hint: Any) -> st.SearchStrategy:
         if cls in SENSOR_MESSAGES:
             low, high = bounds(cls, name)
         return STAMP if name.endswith("_ns") else st.integers(low, high)
-    width = 32 if cls in SENSOR_MESSAGES and is_single(cls, name) else 64
+    single = hint is float and cls in SENSOR_MESSAGES and definition_of(cls, name)[1][0] == "float32"
     plain = {
         bool: st.booleans(),
-        float: st.floats(allow_nan=False, width=width),
+        float: st.floats(allow_nan=False, width=32 if single else 64),
         str: st.text(st.characters(codec="utf-8")),
     }
     return plain[hint]

@@ -20,6 +20,7 @@ from ibrobot_core.api import (
     HardwareError,
     IbrobotError,
     JointTrajectory,
+    MoveJoint,
     PlanningError,
     SlowDown,
     Vector,
@@ -43,6 +44,8 @@ _WATCH_S = 0.02
 """Interval at which motions are checked against the present world [s]."""
 _GRANTED_S = 0.01
 """Interval at which a path is compared with what is granted to an agent [s]."""
+_GRANTED_RAD = 0.02
+"""Interval at which the way of a single joint is compared with it [rad]."""
 _STILL_RAD = 1e-4
 """Commands that change less in a tick count as at rest."""
 _GLANCE_S = 0.1
@@ -176,6 +179,8 @@ class GoalDoor(SessionWorker):
         if not isinstance(goal, FollowTrajectory) or executor not in self._executors:
             if isinstance(goal, SlowDown):
                 self._tracks.pop(executor, None)  # it slows down: who sends this watches it
+            elif isinstance(goal, MoveJoint):
+                self._check_joint_granted(executor, goal.position)
             send(goal)
             return
         if executor not in self.session.config.control_modes[self.session.mode].executors:
@@ -284,6 +289,19 @@ class GoalDoor(SessionWorker):
         whole = np.tile([self._others()[name] for name in robot.joint_names], (len(positions), 1))
         whole[:, columns] = positions
         authority.check_path(whole, float((np.abs(velocities) / robot.max_velocity[columns]).max()))
+
+    def _check_joint_granted(self, executor: str, position: float) -> None:
+        """Check the way of a joint to a position [rad] against what is granted to an agent.
+
+        Raises:
+            HardwareError: if it goes beyond that.
+        """
+        robot, others = self._robot, self._others()
+        here = np.array([others[name] for name in robot.joint_names])
+        there = here.copy()
+        there[robot.indices(self.session.config.executors[executor].joints)] = position
+        steps = 2 + int(np.abs(there - here).max() / _GRANTED_RAD)
+        self.session.authority.check_path(np.linspace(here, there, steps), 0.0)
 
     def _send(self, executor: str, goal_id: str, goal: FollowTrajectory, send: Send) -> None:
         self._check_granted(goal.trajectory)
