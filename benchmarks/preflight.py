@@ -19,7 +19,7 @@ import math
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 from time import perf_counter
 from typing import Any
 
@@ -196,8 +196,8 @@ def planted(table: str, place: str, number: int) -> Iterator[tuple[str, str, Liv
     still = seen(rests)
     joint = number % 4
     for degrees in (2, 5, 17):
-        away = math.radians(degrees) * np.eye(6)[joint]
-        yield f"zero {degrees} degrees", "zero_shifted", changed(still, reads=lambda pose, away=away: pose + away)
+        away = partial(np.add, math.radians(degrees) * np.eye(6)[joint])
+        yield f"zero {degrees} degrees", "zero_shifted", changed(still, reads=away)
     pose = list(REST)
     pose[joint] += math.radians(17) * (-1 if joint == 2 else 1)
     slipped = seen(attrs.evolve(rests, pose=tuple(pose)))
@@ -272,13 +272,13 @@ def main() -> int:
         for kind in ("5 px", "20 px", "40 px", "1 degrees", "3 degrees", "10 degrees")
     ]
     told = sum(each["fail"] + each["warn"] for each in large) / max(1, sum(each.total() for each in large))
-    result = {
+    figures = {
         "unchanged": arguments.unchanged, "accused": wrong, "uncertain": unclear, "missed": missed,
         "moved_on_pattern": told, "px_error": float(np.median([each for values in errors.values() for each in values])),
         "seconds": perf_counter() - begin,
     }  # fmt: skip
-    print(json.dumps(result))
-    report(**result)
+    print(json.dumps(figures))
+    report(**figures)
     return int(missed > 0 or wrong * 200 > arguments.unchanged)
 
 

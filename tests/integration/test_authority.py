@@ -246,7 +246,7 @@ def test_call_that_was_under_way_when_a_person_took_over_moves_nothing(run: Agen
     joints = run.session.config.executors["arm_trajectory"].joints
     there = run.commands[-1][run.session.config.robot.indices(joints)] + 0.3 * np.eye(len(joints))[0]
     point = {"positions": there.tolist(), "time_from_start_ns": 2_000_000_000}
-    requests = {
+    requests: dict[str, Any] = {
         GO_TO: AWAY,
         "/move_action": {"goals": [{"joints": {"shoulder_pan": 1.2}}]},
         "/execute_trajectory": {"joint_names": list(joints), "points": [point]},

@@ -195,6 +195,7 @@ def test_card_keeps_the_rig(tmp_path):
     written.write(tmp_path / "card.json")
     read = Card.read(tmp_path / "card.json").rig
     assert read is not None
+    assert written.rig is not None
     still, kept = (each.cameras[TOP].stills[0] for each in (written.rig, read))
     assert still.picture.shape == (HEIGHT, WIDTH, 3)
     np.testing.assert_array_equal(still.picture, kept.picture)
@@ -206,7 +207,7 @@ def test_card_keeps_the_rig(tmp_path):
 
 def damaged(facts):
     """Every value of the facts of a rig, in turn, replaced by something else of JSON."""
-    wrong = (None, "x", -1, [], {}, float("nan"), True, [1, 2, 3])
+    wrong: tuple[object, ...] = (None, "x", -1, [], {}, float("nan"), True, [1, 2, 3])
     for key in facts:
         for value in wrong:
             yield {**facts, key: value}

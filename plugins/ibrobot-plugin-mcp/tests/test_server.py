@@ -208,7 +208,7 @@ def test_calls_that_an_agent_cancels_keep_their_threads_until_they_are_done(rig:
 def test_client_of_http_is_never_that_of_the_pipes(rig: Rig, session: str) -> None:
     class Piped:
         session = SimpleNamespace(client_params=None)
-        request = None
+        request: Any = None
 
     class Web(Piped):
         request = SimpleNamespace(headers={"mcp-session-id": session})
