@@ -101,7 +101,8 @@ def prepare(work: Path, episodes: int, policies: Sequence[str]) -> None:
 
 def explained(work: Path, policy: str, fault: Fault | None, strength: Any, seed: int) -> dict[str, Any]:
     """A run with a fault, and what is said of it; changes this process."""
-    from ibrobot_diagnose.cause import Reference, diagnose
+    from ibrobot_diagnose.cause import Reference
+    from ibrobot_diagnose.diagnosis import diagnose
     from ibrobot_diagnose.references import card_of, read_episode
     from ibrobot_diagnose.report import Explanation
 

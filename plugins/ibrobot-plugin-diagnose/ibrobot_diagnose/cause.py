@@ -1,16 +1,15 @@
-"""Causes: what they need, what they find, and how findings are ranked."""
+"""Causes: what they need, and what they find."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar, Literal, override
 
 import attrs
 
-from ibrobot_core.api import Descriptor, IbrobotError
-from ibrobot_core.app import installed_plugins
+from ibrobot_core.api import Descriptor
 
 if TYPE_CHECKING:
     import numpy as np
@@ -208,18 +207,6 @@ class Diagnosis:
         return self.findings[0].name if self.findings else ""
 
 
-_LACKS = {
-    "state": "no joint positions were recorded", "commands": "no commands were recorded",
-    "answers": "no answers of a model were recorded", "chunks": "no answer of the model was used",
-    "pictures": "no pictures were recorded", "guard": "the robot had no guard", "outcome": "nobody judged the outcome",
-    "card": "there is no card of the model's data: --data",
-    "card pictures": "there is no card of the model's pictures: --data",
-    "motion": "the arm stands still", "rig": "this is no rig at rest",
-    "rig card": "there is no reference of the rig: `ibrobot preflight --take`",
-    "training card": "there is no card from a training", "model": "the model was not asked: --model",
-}  # fmt: skip
-
-
 _SLOPE = math.log(0.95 / 0.05)
 
 
@@ -233,75 +220,3 @@ def likelihood(number: float, threshold: float, certain: float) -> float:
     tiny = 1e-9
     place = math.log(max(number, tiny) / threshold) / math.log(certain / threshold)
     return 1 / (1 + math.exp(-_SLOPE * max(-20.0, min(20.0, place))))
-
-
-def own_causes() -> tuple[Cause, ...]:
-    """The causes of this package."""
-    from ibrobot_diagnose import causes
-
-    return causes.all_causes()
-
-
-def installed_causes() -> tuple[Cause, ...]:
-    """The causes of this package and of others.
-
-    Raises:
-        IbrobotError: if one has the name of another.
-    """
-    known = {each.name: each for each in own_causes()}
-    for descriptor in installed_plugins().of_kind(KIND):
-        assert isinstance(descriptor, CauseDescriptor)
-        cause = descriptor.make()
-        if cause.name in known:
-            raise IbrobotError(f"there is a cause {cause.name!r} already; the plugin must give its own another name")
-        known[cause.name] = cause
-    return tuple(known.values())
-
-
-def diagnose(
-    window: Window, reference: Reference, causes: Iterable[Cause] | None = None,
-    tested: Callable[[str], None] = lambda name: None,
-) -> Diagnosis:  # fmt: skip
-    """Test all causes, and rank those that are accused.
-
-    Args:
-        window: what happened.
-        reference: what it is compared with.
-        causes: by default all installed ones.
-        tested: called with the name of each cause after its test.
-    """
-    there = window.streams | reference.streams
-    findings: list[Finding] = []
-    healthy, untested, measured = [], [], []
-    for cause in installed_causes() if causes is None else causes:
-        if (cause.needs - there) & {"demonstration", "motion", "rig"}:
-            continue  # it is about another kind of window
-        if lacking := sorted(cause.needs - there):
-            untested.append((cause.name, _LACKS.get(lacking[0], lacking[0])))
-            continue
-        evidence = cause.test(window, reference)
-        if evidence is not None and evidence.likelihood >= ACCUSED:
-            findings.append(Finding(cause, evidence))
-        else:
-            healthy.append((cause.name, cause.title))
-            if evidence is not None:
-                measured.append(Finding(cause, evidence))
-        tested(cause.name)
-    return Diagnosis(ranked(findings), tuple(healthy), tuple(untested), tuple(measured))
-
-
-def ranked(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Findings by likelihood, each after those that explain it; what explains another is at least as likely."""
-    likely = {
-        each.name: max(other.evidence.likelihood for other in findings if other is each or each.explains(other))
-        for each in findings
-    }
-    rest = sorted(findings, key=lambda each: (-likely[each.name], each.name))
-    ordered: list[Finding] = []
-    while rest:
-        free = [each for each in rest if not any(other.explains(each) for other in rest if other is not each)]
-        # Two that explain each other: the one that explains more.
-        chosen = free[0] if free else max(rest, key=lambda each: sum(map(each.explains, rest)))
-        ordered.append(chosen)
-        rest.remove(chosen)
-    return tuple(ordered)

@@ -12,7 +12,8 @@ import attrs
 from ibrobot_core.app import RobotConfig
 from ibrobot_diagnose.arm_view import with_moving
 from ibrobot_diagnose.card import Card
-from ibrobot_diagnose.cause import Diagnosis, Finding, Reference, Verdict, diagnose
+from ibrobot_diagnose.cause import Diagnosis, Finding, Reference, Verdict
+from ibrobot_diagnose.diagnosis import diagnose
 from ibrobot_diagnose.report import finding_facts
 from ibrobot_diagnose.watch import LiveWindow
 from ibrobot_diagnose.window import Window

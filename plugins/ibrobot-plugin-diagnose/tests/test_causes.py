@@ -11,8 +11,9 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_diagnose.card import make_card
-from ibrobot_diagnose.cause import KIND, Cause, CauseDescriptor, Evidence, Reference, diagnose, installed_causes
+from ibrobot_diagnose.cause import KIND, Cause, CauseDescriptor, Evidence, Reference
 from ibrobot_diagnose.causes.data import UnseenStates
+from ibrobot_diagnose.diagnosis import diagnose, installed_causes
 from ibrobot_diagnose.report import Explanation
 from made_runs import Run, window_of
 from planted_faults import JOINTS, PICTURES, TIMES, of_top

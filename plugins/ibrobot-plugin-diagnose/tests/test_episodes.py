@@ -6,7 +6,8 @@ from collections import Counter
 
 import pytest
 from ibrobot_diagnose.card import Maker
-from ibrobot_diagnose.cause import Reference, diagnose
+from ibrobot_diagnose.cause import Reference
+from ibrobot_diagnose.diagnosis import diagnose
 from made_runs import Run, window_of
 from planted_faults import DEMONSTRATED
 

@@ -88,7 +88,8 @@ def explain_episode(
     Raises:
         IbrobotError: if it cannot be read, or the model cannot be asked.
     """
-    from ibrobot_diagnose.cause import Reference, diagnose
+    from ibrobot_diagnose.cause import Reference
+    from ibrobot_diagnose.diagnosis import diagnose
     from ibrobot_diagnose.report import Explanation
 
     episode, options, card = order

@@ -80,6 +80,7 @@ MOVE_TO_POSE = Service(
     MoveResult,
     "Move the tool to a pose; answers when the motion has ended.",
     ros_type="ibrobot_msgs/srv/MoveToPose",
+    cancel=CANCEL,
 )
 MOVE_TO_CONFIGURATION = Service(
     "/moveit_gateway/move_to_configuration",
@@ -87,6 +88,7 @@ MOVE_TO_CONFIGURATION = Service(
     MoveResult,
     "Move joints to positions; answers when the motion has ended.",
     ros_type="ibrobot_msgs/srv/MoveToConfiguration",
+    cancel=CANCEL,
 )
 CMD_POSE = "/cmd_pose"
 """geometry_msgs/msg/PoseStamped or Pose: a goal."""
