@@ -7,6 +7,7 @@ import shlex
 import socket
 import subprocess
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +91,7 @@ def test_scan_lists_a_motor_whose_first_answer_is_lost(adapter: SlcanServer, mon
 
 
 @pytest.mark.integration
+@pytest.mark.skipif(find_spec("ibrobot_diagnose") is None, reason="needs ibrobot-plugin-diagnose")
 def test_preflight_names_what_holds_torque(adapter: SlcanServer, tmp_path: Path) -> None:
     """It switches the torque on, so that the arm keeps its pose, and says how to switch it off."""
     robot = config(tmp_path, adapter.channel, lost_replies=1000)
