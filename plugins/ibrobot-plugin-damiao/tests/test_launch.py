@@ -31,7 +31,8 @@ def robot(tmp_path: Path) -> Path:
 
 def launched(robot: Path, adapter: SlcanServer, *arguments: str) -> subprocess.CompletedProcess[str]:
     """A run of some seconds; a busy machine may keep the emulator, a thread of this process, from answering."""
-    patient = ("--set", "hardware.lost_replies=1000", "--set", "control.state_timeout=60")
+    more = ("hardware.lost_replies=1000", "hardware.retries=20", "control.state_timeout=60")
+    patient = [word for each in more for word in ("--set", each)]
     return subprocess.run(
         [*ibrobot_command(), "launch", str(robot), "--mode", "wave", "--headless", *patient, *arguments],
         env={**os.environ, "IBROBOT_CAN": adapter.channel},
