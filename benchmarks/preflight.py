@@ -196,8 +196,8 @@ def planted(table: str, place: str, number: int) -> Iterator[tuple[str, str, Liv
     still = seen(rests)
     joint = number % 4
     for degrees in (2, 5, 17):
-        away = partial(np.add, math.radians(degrees) * np.eye(6)[joint])
-        yield f"zero {degrees} degrees", "zero_shifted", changed(still, reads=away)
+        moved = partial(np.add, math.radians(degrees) * np.eye(6)[joint])
+        yield f"zero {degrees} degrees", "zero_shifted", changed(still, reads=moved)
     pose = list(REST)
     pose[joint] += math.radians(17) * (-1 if joint == 2 else 1)
     slipped = seen(attrs.evolve(rests, pose=tuple(pose)))

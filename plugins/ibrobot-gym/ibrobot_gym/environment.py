@@ -176,6 +176,8 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._tick()
         if not session.reset_episode(seed):
             raise HardwareError("the episode cannot begin: an emergency stop is latched")
+        if session.held:  # since a fault was reset within an episode; the program wants to go on
+            session.bus.call("/set_mode", session.mode)
         self._begun_ns = session.clock.now_ns()
         self._source.begin(seed)
         while (frame := self._source.frame) is None:

@@ -44,6 +44,8 @@ _WATCH_S = 0.02
 """Interval at which motions are checked against the present world [s]."""
 _GRANTED_S = 0.01
 """Interval at which a path is compared with what is granted to an agent [s]."""
+_FAR_RAD = 100.0
+"""Positions beyond which no joint can be [rad], as none is at NaN."""
 _GRANTED_RAD = 0.02
 """Interval at which the way of a single joint is compared with it [rad]."""
 _STILL_RAD = 1e-4
@@ -300,6 +302,8 @@ class GoalDoor(SessionWorker):
         here = np.array([others[name] for name in robot.joint_names])
         there = here.copy()
         there[robot.indices(self.session.config.executors[executor].joints)] = position
+        if not (np.abs(there) < _FAR_RAD).all():
+            return  # the executor refuses it
         steps = 2 + int(np.abs(there - here).max() / _GRANTED_RAD)
         self.session.authority.check_path(np.linspace(here, there, steps), 0.0)
 
