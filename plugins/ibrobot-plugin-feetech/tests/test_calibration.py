@@ -8,27 +8,15 @@ from typing import Any
 
 import attrs
 import pytest
+from calibration_files import calibrations
 from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_calibration import Calibration, JointCalibration, load_calibration
-from ibrobot_feetech.calibration import ZERO_AT, save_calibration
+from ibrobot_feetech.calibration import save_calibration
 
 from ibrobot_core.api import CalibrationError
 
 GOOD: dict[str, Any] = {"id": 1, "drive_mode": 0, "homing_offset": -12, "range_min": 700, "range_max": 3400}
-
-
-@st.composite
-def calibrations(draw: st.DrawFn) -> Calibration:
-    names = draw(st.lists(st.sampled_from(["pan", "lift", "elbow", "wrist", "gripper"]), min_size=1, unique=True))
-    joints = {}
-    zero_at = draw(st.sampled_from(sorted(ZERO_AT)))
-    for number, name in enumerate(names, 1):
-        low = draw(st.integers(0, 4094))
-        high = draw(st.integers(low + 1, 4095))
-        drive_mode, offset = draw(st.integers(0, 1)), draw(st.integers(-2047, 2047))
-        joints[name] = JointCalibration(number, drive_mode, offset, low, high, zero_at)
-    return Calibration(joints, robot="left", date="2026-01-02T03:04:05+00:00")
 
 
 @given(calibrations(), st.booleans())

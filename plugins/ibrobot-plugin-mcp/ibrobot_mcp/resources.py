@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import mcp_types as types
+from ibrobot_provenance.option_schemas import OptionSchemas
 
 from ibrobot_core.api import IbrobotError, seconds
 from ibrobot_core.app import RequestError, RunView, dump_yaml
-from ibrobot_mcp.schemas import request_schema
 
 _MOST = 500
 """Most episodes in the list, the newest ones."""
@@ -55,7 +55,10 @@ class Resources:
     def _services(self) -> str:
         served = self._session.bus.services().items()
         return json.dumps({
-            name: {"help": each.help, "request": request_schema(each), "reads": each.reads, "persons": each.persons}
+            name: {
+                "help": each.help, "request": OptionSchemas().of_class(each.request), "reads": each.reads,
+                "persons": each.persons,
+            }
             for name, each in served
         }, default=str)  # fmt: skip
 

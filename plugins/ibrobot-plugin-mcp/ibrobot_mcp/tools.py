@@ -11,13 +11,13 @@ from typing import Any, get_args
 
 import attrs
 import mcp_types as types
+from ibrobot_provenance.option_schemas import OptionSchemas
 from ibrobot_ros2.services import plain
 
 from ibrobot_core.api import IbrobotError, documented, option, seconds
 from ibrobot_core.app import Agent, RequestError, RunView, Service, fields
 from ibrobot_mcp.audit import authority_of
 from ibrobot_mcp.pictures import Sight, cameras, look
-from ibrobot_mcp.schemas import request_schema
 
 NAMES: Mapping[str, str] = {
     "/planning/go_to": "go_to",
@@ -91,7 +91,9 @@ class RobotTool:
         service, moves = self.service, not (self.service.reads or self.service.urgent)
         text = service.help + (" A person must grant it, see `authority`." if moves else "")
         hints = types.ToolAnnotations(read_only_hint=service.reads, destructive_hint=moves, open_world_hint=False)
-        return types.Tool(name=name, description=text, input_schema=request_schema(service), annotations=hints)
+        return types.Tool(
+            name=name, description=text, input_schema=OptionSchemas().of_class(service.request), annotations=hints
+        )
 
 
 class Tools:

@@ -1,4 +1,4 @@
-"""What agents are told and may do, by the client of the SDK."""
+"""What agents see and may do, by the client of the SDK."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_tools_are_the_services_as_they_are_declared(rig: Rig, mode: str) -> Non
     assert move.description == "Move. A person must grant it, see `authority`."
     assert move.input_schema["required"] == ["to"]
     assert move.input_schema["properties"]["to"] == {
-        "type": "number", "description": "Where to [rad].", "minimum": -1, "maximum": 1,
+        "type": "number", "description": "where to [rad]", "minimum": -1, "maximum": 1,
     }  # fmt: skip
     assert move.input_schema["properties"]["how"]["enum"] == ["gently", "fast"]
     assert (move.annotations.read_only_hint, tools["test_state"].annotations.read_only_hint) == (False, True)

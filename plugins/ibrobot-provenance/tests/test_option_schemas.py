@@ -10,7 +10,7 @@ import jsonschema
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ibrobot_mcp.schemas import request_schema
+from ibrobot_provenance.option_schemas import OptionSchemas
 
 from ibrobot_core.api import option
 from ibrobot_core.app import RequestError, Service
@@ -37,7 +37,7 @@ class Outer:
 
 
 SERVICE = Service("/outer", Outer, type(None))
-SCHEMA = request_schema(SERVICE)
+SCHEMA = OptionSchemas().of_class(SERVICE.request)
 JSON = st.recursive(
     st.none()
     | st.booleans()
@@ -52,15 +52,35 @@ KEYS = st.fixed_dictionaries({}, optional={name: JSON for name in attrs.fields_d
 
 def test_schema_says_type_unit_bounds_and_default() -> None:
     assert SCHEMA["properties"]["count"] == {
-        "type": "integer", "description": "A number.", "minimum": 0, "maximum": 9, "default": 1,
+        "type": "integer", "description": "a number", "minimum": 0, "maximum": 9, "default": 1,
     }  # fmt: skip
     inner = SCHEMA["properties"]["parts"]["items"]
-    assert inner["properties"]["x"] == {"type": "number", "description": "A distance [m].", "default": 0.0}
+    assert inner["properties"]["x"] == {"type": "number", "description": "a distance [m]", "default": 0.0}
     assert inner["properties"]["way"]["enum"] == ["up", "down"]
     assert SCHEMA["properties"]["xyz"]["anyOf"][0] == {
         "type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3,
     }  # fmt: skip
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
+
+
+@attrs.frozen
+class Chosen:
+    """Options with choices, and one of the same class."""
+
+    any_of: str = option("a", choices=("a", "b"), open=True, help="one of these, or another")
+    several: tuple[str, ...] = option((), choices=("a", "b"), help="some of these")
+    mixed: tuple[str, int] = option(("a", 1), help="a text and a number")
+    again: Chosen | None = option(None, help="the same again")
+
+
+def test_choices_limit_items_and_not_what_is_open_and_a_class_within_itself_ends() -> None:
+    schema = OptionSchemas().of_class(Chosen)
+    validator = jsonschema.Draft202012Validator(schema)
+    validator.check_schema(schema)
+    for right in ({"any_of": "c"}, {"several": ["a", "b"]}, {"mixed": ["x", 2]}, {"again": {"again": None}}):
+        assert validator.is_valid(right), right
+    for wrong in ({"several": ["a", "c"]}, {"mixed": ["x", "y"]}, {"mixed": ["x", 1, 2]}, {"again": {"any_of": 1}}):
+        assert not validator.is_valid(wrong), wrong
 
 
 @settings(max_examples=400, deadline=None)
