@@ -13,11 +13,11 @@ from ibrobot_testing import host_context, make_robot
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import RealClock
 from ibrobot_core.contract.specs import Contract
+from ibrobot_core.descriptors import Options
 from ibrobot_core.dispatch.dispatcher import Dispatcher
 from ibrobot_core.inference.client import Chunk, EngineClient
 from ibrobot_core.interfaces import Policy, Transport
 from ibrobot_core.messages import Header, JointState
-from ibrobot_core.options import NoOptions
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.robot import Vector
 from ibrobot_core.schema import (
@@ -55,7 +55,7 @@ class Robot:
         joints = robot.joint_names
         config = RobotConfig(
             robot=robot,
-            executors={"all": ExecutorConfig("position", NoOptions(), "all", "all", joints)},
+            executors={"all": ExecutorConfig("position", Options(), "all", "all", joints)},
             control_modes={"idle": ControlMode(())},
             default_control_mode="idle",
             contract=ContractConfig(

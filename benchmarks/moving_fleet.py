@@ -69,7 +69,7 @@ from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
 
 @attrs.frozen
-class Options:
+class GivenOptions(Options):
     path: Path = option(help="a folder with the files `weights` and `fault`")
 
 class Sine(FakePolicy):
@@ -91,7 +91,7 @@ class Sine(FakePolicy):
 
 @hookimpl
 def ibrobot_policies():
-    yield PolicyDescriptor("sine", lambda options, ctx: Sine(options, ctx), "a sine", options=Options)
+    yield PolicyDescriptor("sine", lambda options, ctx: Sine(options, ctx), "a sine", options=GivenOptions)
 """
 
 

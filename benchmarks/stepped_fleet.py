@@ -30,11 +30,11 @@ from ibrobot_testing import make_robot
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.contract.specs import Contract
+from ibrobot_core.descriptors import Options
 from ibrobot_core.dispatch.dispatcher import Dispatcher
 from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient
 from ibrobot_core.interfaces import PolicySpec
 from ibrobot_core.messages import Header, JointState
-from ibrobot_core.options import NoOptions
 from ibrobot_core.schema import (
     ActionSpec,
     ContractConfig,
@@ -150,7 +150,7 @@ class Robot(InferenceClient):
         robot = make_robot()
         config = RobotConfig(
             robot=robot,
-            executors={"all": ExecutorConfig("position", NoOptions(), "all", "all", robot.joint_names)},
+            executors={"all": ExecutorConfig("position", Options(), "all", "all", robot.joint_names)},
             control_modes={"idle": ControlMode(())},
             default_control_mode="idle",
             contract=ContractConfig(RATE_HZ, observations=(state,), actions=(ActionSpec("all", "/commands"),)),

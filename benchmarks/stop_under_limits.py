@@ -67,12 +67,12 @@ MOVED = struct.Struct("<qq")
 PLUGIN = """
 import mmap, os, struct, time, math
 import attrs
-from ibrobot_core.api import (Hardware, HardwareDescriptor, JointReading, NoOptions, Teleop, TeleopCommand,
+from ibrobot_core.api import (Hardware, HardwareDescriptor, JointReading, Options, Teleop, TeleopCommand,
                               TeleopDescriptor, hookimpl, option)
 import numpy as np
 
 @attrs.frozen
-class WitnessOptions:
+class WitnessOptions(Options):
     file: str = option(help="shared file")
 
 class Witness(Hardware):
@@ -116,7 +116,7 @@ def ibrobot_hardware():
 
 @hookimpl
 def ibrobot_teleop():
-    yield TeleopDescriptor(type="swinging", options=NoOptions, make=Swing, summary="swings by itself")
+    yield TeleopDescriptor(type="swinging", options=Options, make=Swing, summary="swings by itself")
 """
 ROBOT = """
 robot:

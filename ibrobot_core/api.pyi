@@ -26,11 +26,10 @@ from ibrobot_core.options import (
     not_a_key as not_a_key,
     documented as documented,
     not_empty as not_empty,
-    NoOptions as NoOptions,
     OptionFault as OptionFault,
     did_you_mean as did_you_mean,
 )
-from ibrobot_core.descriptors import StreamOptions as StreamOptions
+from ibrobot_core.descriptors import Options as Options, StreamOptions as StreamOptions
 
 # The robot
 from ibrobot_core.robot import Robot as Robot, Joint as Joint, Description as Description, Vector as Vector

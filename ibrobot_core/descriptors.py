@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import attrs
 
 from ibrobot_core.errors import PluginError
-from ibrobot_core.options import NoOptions, OptionFault, OptionName, documented, mistakes, option
+from ibrobot_core.options import OptionFault, OptionName, documented, mistakes, option
 
 if TYPE_CHECKING:
     from ibrobot_core import interfaces
@@ -52,6 +52,100 @@ def _answer(default: object) -> Any:
 
 
 @attrs.frozen
+class Options:
+    """Options of an implementation: a frozen attrs class that derives from this one, with a field for each key.
+
+    Its methods and properties say what core must know before it makes an object; by default, nothing. They open no
+    device, and import nothing heavy.
+    """
+
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+        """Yields faults of the options for a robot, e.g. an unknown joint.
+
+        Args:
+            robot: the robot, or the part of it that a device moves.
+            joints: the joints that the component owns, or all joints if its kind owns none.
+        """
+        return ()
+
+    def devices(self) -> Mapping[str, str]:
+        """Maps options to devices that only one component can open at a time, in a canonical form."""
+        return {}
+
+    def peripherals(self) -> Iterable[OptionName]:
+        """The peripherals of the robot YAML that options name."""
+        return ()
+
+    def publishes(self) -> Iterable[OptionName]:
+        """The topics that options name and the component publishes, which nothing else may publish."""
+        return ()
+
+    def offers(self, service: str) -> bool:
+        """Whether other programs can call a service of the run, by its name, through the component."""
+        return False
+
+    @property
+    def calibration(self) -> str | None:
+        """Of hardware and teleop: name or path of the calibration; recordings contain that of hardware."""
+        return None
+
+    @property
+    def calibrated_by(self) -> str | None:
+        """Of hardware and teleop: the command that has `calibrate` and `import` for its calibrations, for messages."""
+        return None
+
+    @property
+    def anchored(self) -> tuple[str, ...]:
+        """Of hardware: the joints whose calibrated closed end is at their lower limit, such as a gripper.
+
+        In LeRobot's units they range from 0 to 100.
+        """
+        return ()
+
+    def scene_objects(self, robot: Robot) -> Sequence[interfaces.SceneObject]:
+        """Of simulated hardware: the objects around the robot, for planners."""
+        return ()
+
+    @property
+    def picture(self) -> tuple[int, int] | None:
+        """Of sensors: height and width of the images [px], if the options define them."""
+        return None
+
+    def find_device(self) -> None:
+        """Of sensors: looks for the device that the options name, without opening it.
+
+        Raises:
+            MissingDependency: if it is not there. A run continues without a sensor that it does not need.
+        """
+
+    def events(self) -> Collection[interfaces.OperatorEvent]:
+        """Of teleop: the events for which the device has a button, e.g. `start` to begin an episode."""
+        return ()
+
+    def terminal_keys(self, robot: Robot) -> Mapping[str, str]:
+        """Of teleop: maps the keys that the device reads from the terminal to what they do, e.g. `space` to `deadman`.
+
+        A device with keys needs a terminal. Devices of one mode share a key only if it does the same for all of them.
+
+        Args:
+            robot: what the device moves.
+        """
+        return {}
+
+    @property
+    def used(self) -> bool:
+        """Of transports: whether a run uses the transport even if no mode needs it."""
+        return False
+
+    def components(self, run: RunAccess, link: TransportLink) -> Sequence[Component]:
+        """Of transports: components that the options add to a run, e.g. to send topics to other machines.
+
+        Each needs `link.name`; when it starts, `link.transport` is open.
+        """
+        return ()
+
+
+@attrs.frozen
 class Descriptor[T]:
     """An implementation of one kind.
 
@@ -65,29 +159,14 @@ class Descriptor[T]:
     summary: str
     label: str = attrs.field(default="", kw_only=True)
     """What it does, in the words of an operator who chooses it, e.g. `follow the leader arm`; empty: its summary."""
-    options: builtins.type[Any] = NoOptions
-    """A frozen attrs class made with `ibrobot_core.options.option`."""
+    options: builtins.type[Any] = Options
+    """The class of its options, which derives from `Options`."""
     check: Callable[[], None] = _answer(None)
     """Checks dependencies other than Python packages; imports nothing heavy.
 
     Raises:
         MissingDependency: e.g. if a system library is missing. A run continues without a sensor that it does not need.
     """
-    check_options: Callable[[Any, Robot, tuple[str, ...]], Iterable[OptionFault]] = _answer(())
-    """Yields faults of the options for a robot, e.g. an unknown joint. The third argument is the joints that the
-    component owns, or all joints if its kind owns none. Opens no device, and imports nothing heavy."""
-    devices: Callable[[Any], Mapping[str, str]] = _answer({})
-    """Maps options to devices that only one component can open at a time, in a canonical form."""
-    peripherals: Callable[[Any], Iterable[OptionName]] = _answer(())
-    """The peripherals of the robot YAML that options name."""
-    publishes: Callable[[Any], Iterable[OptionName]] = _answer(())
-    """The topics that options name and the component publishes, which nothing else may publish."""
-    calibration: Callable[[Any], str | None] = _answer(None)
-    """Name or path of the calibration in the options, None without one; recordings contain that of hardware."""
-    tool: str | None = attrs.field(default=None, kw_only=True)
-    """The command that has `calibrate` and `import` for its calibrations, for messages."""
-    offers: Callable[[Any, str], bool] = _answer(False)
-    """Whether other programs can call a service of the run, by its name, through a component with these options."""
     default: bool = attrs.field(default=False, kw_only=True)
     """Whether commands use this type by default; at most one type of each kind."""
 
@@ -99,13 +178,13 @@ class Descriptor[T]:
             yield f"make is {self.make!r}: give a class, or a function that makes the object"
         if lacking := sorted(getattr(self.make, "__abstractmethods__", ())):
             yield f"make is an abstract class: it lacks {', '.join(lacking)}"
-        yield from (f"options: {mistake}" for mistake in mistakes(self.options))
+        yield from (f"options: {mistake}" for mistake in mistakes(self.options, Options))
 
     def fits(self, section: builtins.type[ComponentConfig]) -> bool:
         """Whether it may be used in a section of its kind."""
         return True
 
-    def kept(self, options: Any) -> Mapping[str, Any]:
+    def kept(self) -> Mapping[str, Any]:
         """Fields of its section that are no keys, by name; a section without such a field leaves it out."""
         return {}
 
@@ -119,11 +198,6 @@ class HardwareDescriptor(Descriptor["interfaces.Hardware"]):
     """For simulated hardware: sensor kind, e.g. `camera` -> sensor type that replaces it."""
     torque_off: str = ""
     """For joints that hold even without a process that commands them: the command that switches their torque off."""
-    anchored: Callable[[Any], tuple[str, ...]] = _answer(())
-    """The joints whose calibrated closed end is at their lower limit, such as a gripper. In LeRobot's units they range
-    from 0 to 100."""
-    scene: Callable[[Any, Robot], Sequence[interfaces.SceneObject]] = _answer(())
-    """For simulated hardware: the objects around the robot, for planners."""
     film: Mapping[str, Any] = attrs.field(factory=dict, kw_only=True)
     """For simulated hardware: the keys of a peripheral of kind `camera` that films the robot and all of its scene."""
 
@@ -131,34 +205,20 @@ class HardwareDescriptor(Descriptor["interfaces.Hardware"]):
         """Whether the section is for simulated hardware, as it is or is not."""
         return self.simulated == section.simulates
 
-    def kept(self, options: Any) -> Mapping[str, Any]:
-        """Its calibration and its anchored joints."""
-        return {"calibration": self.calibration(options), "tool": self.tool, "anchored": self.anchored(options)}
-
 
 @attrs.frozen
 class SensorDescriptor(Descriptor["interfaces.Sensor"]):
     """A sensor of a kind, e.g. `camera` or `imu`."""
 
     kind: str = "camera"
-    picture: Callable[[Any], tuple[int, int] | None] = _answer(None)
-    """Height and width of the images [px], if the options define them."""
-    find: Callable[[Any], None] = _answer(None)
-    """Looks for the device that the options name, without opening it.
-
-    Raises:
-        MissingDependency: if it is not there. A run continues without a sensor that it does not need.
-    """
-
     topic: str = ""
     """Topic of its messages, with `{name}` for the peripheral's; empty for a camera, and if only its options say it."""
     message: str = ""
     """ROS type of its messages, with `topic`."""
 
-    def kept(self, options: Any) -> Mapping[str, Any]:
-        """The size of its images, and its topic."""
-        given = {"topic": self.topic, "message": self.message} if self.topic else {}
-        return {"picture": self.picture(options), **given}
+    def kept(self) -> Mapping[str, Any]:
+        """Its topic."""
+        return {"topic": self.topic, "message": self.message} if self.topic else {}
 
 
 @attrs.frozen
@@ -193,18 +253,6 @@ class MessageDescriptor:
 class TeleopDescriptor(Descriptor["interfaces.Teleop"]):
     """A teleoperation device."""
 
-    events: Callable[[Any], Collection[interfaces.OperatorEvent]] = _answer(())
-    """The events for which the device has a button, by its options, e.g. `start` to begin an episode."""
-    keys: Callable[[Any, Robot], Mapping[str, str]] = _answer({})
-    """Maps the keys that the device reads from the terminal to what they do, e.g. `space` to `deadman`, by its options
-    and the robot that it moves. Devices of one mode share a key only if it does the same for all of them."""
-    needs_terminal: Callable[[Any], bool] = _answer(False)
-    """Whether the device works only in runs with a terminal, by its options."""
-
-    def kept(self, options: Any) -> Mapping[str, Any]:
-        """Its calibration."""
-        return {"calibration": self.calibration(options), "tool": self.tool}
-
 
 @attrs.frozen
 class PolicyDescriptor(Descriptor["interfaces.Policy"]):
@@ -226,14 +274,14 @@ class EngineDescriptor(Descriptor["interfaces.Engine"]):
     weights_here: bool = True
     """Whether this machine has the model's weights, so that `ibrobot config check --deep` checks them."""
 
-    def kept(self, options: Any) -> Mapping[str, Any]:
+    def kept(self) -> Mapping[str, Any]:
         """Its needs."""
         return {"uses_transport": self.uses_transport, "weights_here": self.weights_here}
 
 
 @documented
 @attrs.frozen
-class StreamOptions:
+class StreamOptions(Options):
     """Options of any executor that follows a stream of setpoints."""
 
     stale_timeout: float = option(0.25, unit="s", gt=0, help="age at which the last setpoint becomes stale")
@@ -254,7 +302,7 @@ class ExecutorDescriptor(Descriptor["interfaces.Executor"]):
     """The goals of an executor that does not stream: `trajectory` (`FollowTrajectory`) or `position` (`MoveJoint`).
     The result of an aborted trajectory has the key `exceeded` if a tolerance was: `path` or `goal`."""
 
-    def kept(self, options: Any) -> Mapping[str, Any]:
+    def kept(self) -> Mapping[str, Any]:
         """The kind of goals that it takes."""
         return {"goals": "" if self.streams else self.goals}
 
@@ -276,11 +324,6 @@ class TransportDescriptor(Descriptor["interfaces.Transport"]):
     listen: Callable[[Sequence[str]], Mapping[str, Any]] | None = None
     """Maps endpoints to the options of a server that listens there and does not connect; without endpoints, it listens
     on this machine only. None if servers cannot use this transport."""
-    used: Callable[[Any], bool] = _answer(False)
-    """Whether a run with these options uses the transport even if no mode needs it."""
-    components: Callable[[Any, RunAccess, TransportLink], Sequence[Component]] = _answer(())
-    """Returns components that the options add to a run with this transport, e.g. to send topics to other machines. Each
-    needs `link.name`; when it starts, `link.transport` is open."""
 
 
 @attrs.frozen
@@ -438,7 +481,7 @@ class Command:
     @property
     def options(self) -> builtins.type[Any]:
         """The class."""
-        return self.does.load() if isinstance(self.does, Late) else self.does or NoOptions
+        return self.does.load() if isinstance(self.does, Late) else self.does or Options
 
     @property
     def summary(self) -> str:

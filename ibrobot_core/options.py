@@ -13,11 +13,6 @@ import attrs
 
 
 @attrs.frozen
-class NoOptions:
-    """Options of implementations that have none."""
-
-
-@attrs.frozen
 class OptionFault:
     """A conflict between an option and the rest of the robot, e.g. a joint that the robot does not have."""
 
@@ -153,14 +148,17 @@ def fields(kind: type[Any]) -> Mapping[str, attrs.Attribute[Any]]:
     return _FIELDS[kind]
 
 
-def mistakes(kind: Any) -> Iterator[str]:
-    """What is wrong with an options class, in words for its author."""
-    if not (isinstance(kind, type) and attrs.has(kind)):
-        yield f"{kind!r} is not an attrs class: decorate it with @attrs.frozen"
+def mistakes(kind: Any, base: type) -> Iterator[str]:
+    """What is wrong with an options class, which derives from `base`, in words for its author."""
+    if not isinstance(kind, type) or (inspect.get_annotations(kind) and "__attrs_attrs__" not in vars(kind)):
+        yield f"{kind!r} is not an attrs class: give one that is decorated with @attrs.frozen"
         return
-    if kind.__hash__ is None:  # as of `attrs.define`
-        yield f"{kind.__name__} can be changed: decorate it with @attrs.frozen"
-    for field in attrs.fields(kind):
+    if not issubclass(kind, base):
+        yield f"{kind.__name__} does not derive from {base.__name__}: class {kind.__name__}({base.__name__})"
+        return
+    for field in attrs.fields(kind):  # type: ignore[arg-type]
+        if inspect.isfunction(vars(base).get(field.name)):
+            yield f"{kind.__name__}.{field.name} hides a method of {base.__name__}: rename it, with key='{field.alias}'"
         default = default_of(field)
         try:
             if field.validator and default is not attrs.NOTHING:

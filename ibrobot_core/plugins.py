@@ -204,7 +204,7 @@ class Registry:
         package = next(name for name, offers in official_plugins().items() if kind in offers.get("default", ()))
         raise PluginError(f"no {kind} is named, and no installed plugin has a default: {how_to_install(package)}")
 
-    def missing(self, kind: str, type_: str, options: Any = None) -> MissingDependency | None:
+    def missing(self, kind: str, type_: str, options: descriptors.Options | None = None) -> MissingDependency | None:
         """The dependency that this machine lacks for `type_`, or None. A check that raises is reported too.
 
         With the options of a sensor, also the device that they name.
@@ -215,8 +215,8 @@ class Registry:
         descriptor = self.find(kind, type_)
         try:
             descriptor.check()
-            if isinstance(descriptor, descriptors.SensorDescriptor) and options is not None:
-                descriptor.find(options)
+            if options is not None:
+                options.find_device()
         except MissingDependency as missing:
             return missing
         except BaseException as error:  # noqa: BLE001 - contained: a plugin's fault must not hide the other checks

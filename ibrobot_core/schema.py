@@ -34,12 +34,6 @@ class HardwareConfig(NamedComponentConfig):
     may_be_alone = True
 
     joints: tuple[str, ...] = option((), help="its joints; a single component may omit them and owns all")
-    calibration: str | None = not_a_key(None)
-    """Name or path of the calibration."""
-    tool: str | None = not_a_key(None)
-    """The command that makes it."""
-    anchored: tuple[str, ...] = not_a_key(())
-    """Joints whose calibrated closed end is their lower limit."""
 
 
 @attrs.frozen
@@ -84,8 +78,6 @@ class PeripheralConfig(ComponentConfig):
     kind: str = option(help="camera, imu, …")
     transform: Mount | None = option(None, help="where it is mounted")
     sim: Mapping[str, Any] = option(factory=dict, help="further options for the simulated sensor")
-    picture: tuple[int, int] | None = not_a_key(None)
-    """Height and width of its images [px], if the options determine them."""
     topic: str = not_a_key(attrs.Factory(lambda self: _CAMERA_TOPIC if self.kind == "camera" else "", takes_self=True))
     """Topic of its messages, with `{name}` for its name; empty if only its options say it."""
     message: str = not_a_key(Image.ros_type)
@@ -115,11 +107,6 @@ class TeleopConfig(NamedComponentConfig):
     """A teleoperation device."""
 
     plugin_kind = "teleop"
-
-    calibration: str | None = not_a_key(None)
-    """Name or path of the calibration."""
-    tool: str | None = not_a_key(None)
-    """The command that makes it."""
 
 
 @attrs.frozen

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 HEAD = """
 import attrs
-from ibrobot_core.api import HardwareDescriptor, Teleop, TeleopDescriptor, SensorDescriptor, hookimpl, option
+from ibrobot_core.api import HardwareDescriptor, Teleop, TeleopDescriptor, SensorDescriptor, Options, hookimpl, option
 
 
 @attrs.frozen
-class Options:
+class Given(Options):
     gain: float = option(1.0, ge=0)
 
 
@@ -33,7 +33,7 @@ YIELDS = """
 
 @hookimpl
 def ibrobot_teleop():
-    yield TeleopDescriptor("wave", Wave, "waves", options=Options)
+    yield TeleopDescriptor("wave", Wave, "waves", options=Given)
 """
 OPTIONS = "option(1.0, ge=0)"
 MISTAKES = {
@@ -42,11 +42,14 @@ MISTAKES = {
     "type with an escape": ('"wave"', r'"wave\033[1m"', r"type 'wave\x1b[1m' is not a name"),
     "no make": ("Wave,", "None,", "make is None: give a class, or a function that makes the object"),
     "abstract class": ("Wave,", "Teleop,", "make is an abstract class: it lacks connect, disconnect, read"),
-    "options of a plain class": ("@attrs.frozen", "", "options: <class 'fake_wave.Options'> is not an attrs class"),
-    "options that change": ("@attrs.frozen", "@attrs.define", "options: Options can be changed: decorate it with"),
-    "options of no class": ("options=Options", "options=Options()", "must be a builtins.type[Any], not Options(gain="),
+    "options of a plain class": ("@attrs.frozen", "", "options: <class 'fake_wave.Given'> is not an attrs class"),
+    "options that derive from nothing": ("Given(Options)", "Given", "options: Given does not derive from Options"),
+    "option with the name of a method": (
+        "gain: float", "devices: float", "Given.devices hides a method of Options: rename it, with key='devices'",
+    ),
+    "options of no class": ("options=Given", "options=Given()", "must be a builtins.type[Any], not Given(gain="),
     "default out of range": (
-        OPTIONS, "option(-1.0, ge=0)", "options: the default of Options.gain fails its own check: -1.0 is too small",
+        OPTIONS, "option(-1.0, ge=0)", "options: the default of Given.gain fails its own check: -1.0 is too small",
     ),
     "default of no choice": (OPTIONS, "option('x', choices=('a', 'b'))", "fails its own check: 'x' is not one of: a"),
     "sensor of the hook of devices": ("TeleopDescriptor(", "SensorDescriptor(", "expected a TeleopDescriptor, got "),

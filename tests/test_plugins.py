@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from ibrobot_testing import host_context
 
+from ibrobot_core.descriptors import Options
 from ibrobot_core.errors import ContractError, NotSupported, PluginError
 from ibrobot_core.messages import CompressedImage, Header
-from ibrobot_core.options import NoOptions
 from ibrobot_core.plugins import KINDS, Registry, discover
 
 if TYPE_CHECKING:
@@ -202,7 +202,7 @@ def test_events_reach_all_though_one_raises(registry: Registry, caplog: pytest.L
 
 def test_transport_local_is_the_word_for_none() -> None:
     with pytest.raises(NotSupported, match="transport local connects to nothing"):
-        discover([]).find("transport", "local").make(NoOptions(), host_context())
+        discover([]).find("transport", "local").make(Options(), host_context())
 
 
 def test_every_kind_has_a_hook() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import platform
 import resource
-import shutil
 
 import attrs
 
@@ -15,7 +14,6 @@ from ibrobot_core.errors import Unsuccessful
 from ibrobot_core.plugins import Registry, installed_plugins
 from ibrobot_core.safe_output import echo
 
-LEAST_FREE_BYTES = 2_000_000_000
 _REMEDY = f"run this and log in again: {PERMIT}"
 MLOCK_BYTES = 512 * 1024 * 1024
 """Memory locked by a control process with a simulation, with a margin [bytes]."""
@@ -41,9 +39,9 @@ class Doctor:
 
 
 def examine(registry: Registry) -> list[Check]:
-    """Run all checks: Python, plugins and their checks, dependencies of types, real-time permissions, disk."""
+    """Run all checks: Python, plugins and their checks, dependencies of types, real-time permissions."""
     python = Check("python", True, platform.python_version())  # an older one cannot import this file
-    devices = (realtime(), memory_lock(), disk("."))
+    devices = (realtime(), memory_lock())
     return [python, *plugin_checks(registry), *registry.doctor(), *types(registry), *devices]
 
 
@@ -84,10 +82,3 @@ def memory_lock() -> Check:
     unlimited = os.geteuid() == 0 or limit == resource.RLIM_INFINITY
     allowed = "unlimited" if unlimited else f"{limit / 1e6:.0f} MB"
     return Check("memory lock", unlimited or limit >= MLOCK_BYTES, allowed, _REMEDY, matters=False)
-
-
-def disk(folder: str) -> Check:
-    """Check the disk space for recordings."""
-    free = shutil.disk_usage(folder).free
-    remedy = f"free at least {LEAST_FREE_BYTES / 1e9:.0f} GB, or record elsewhere with recording.root"
-    return Check("disk", free >= LEAST_FREE_BYTES, f"{free / 1e9:.1f} GB free in {os.path.abspath(folder)}", remedy)

@@ -19,13 +19,13 @@ import attrs
 from ibrobot_core.cli.display import Lines, RunDisplay, RunTerminal
 from ibrobot_core.clock import RealClock
 from ibrobot_core.config import RobotConfig
+from ibrobot_core.descriptors import Options
 from ibrobot_core.errors import IbrobotError, PluginError, RequestError, TeleopError
 from ibrobot_core.interfaces import Context
 from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.models import check_models
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Session
-from ibrobot_core.options import NoOptions
 from ibrobot_core.output_thread import discard, output_aside
 from ibrobot_core.plugins import Registry, installed_plugins
 from ibrobot_core.pulses import PULSE_S, Pulse
@@ -105,7 +105,7 @@ def _terminal(config: RobotConfig, registry: Registry) -> RunTerminal | None:
     except PluginError as error:
         logging.getLogger("ibrobot").warning("neither panel nor keys, so Esc does not stop the robot: %s", error)
         return None
-    made: RunTerminal = registry.create("terminal", type_, NoOptions(), Context.of(config, "terminal", RealClock()))
+    made: RunTerminal = registry.create("terminal", type_, Options(), Context.of(config, "terminal", RealClock()))
     return made
 
 

@@ -15,7 +15,7 @@ from ibrobot_core.config.structure import MODELS, ParsedComponent, ParsedSection
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.convert import Key
 from ibrobot_core.deadman import HOLD_S, LONGEST_BRAKING_S
-from ibrobot_core.descriptors import ExecutorDescriptor, TeleopDescriptor, TransportDescriptor
+from ibrobot_core.descriptors import ExecutorDescriptor
 from ibrobot_core.options import OptionFault
 from ibrobot_core.plugins import example_type
 from ibrobot_core.robot import Robot
@@ -133,10 +133,9 @@ class Checks:
         for part in self.sections.all():
             keys: dict[str, str] = {}
             for seen, joints in self._seen_by(part, robot):
-                for fault in part.descriptor.check_options(part.component.options, seen, joints):
+                for fault in part.component.options.check(seen, joints):
                     self._fault(part.key, fault)
-                if isinstance(part.descriptor, TeleopDescriptor):
-                    keys |= part.descriptor.keys(part.component.options, seen)
+                keys |= part.component.options.terminal_keys(seen)
             for key in keys:
                 self._key(key, part.key)
             for key, does in keys.items():
@@ -183,7 +182,7 @@ class Checks:
         """Check that no two components that are open at the same time open the same device."""
         users: dict[str, list[Key]] = {}
         for part in (*self.sections.active(), *self.sections.teleoperation.values()):
-            for option, device in part.descriptor.devices(part.component.options).items():
+            for option, device in part.component.options.devices().items():
                 for user in users.setdefault(device, []):
                     if user != part.key and self._open_together(user, part.key):
                         message = f"{device} is already used by {self.document.dotted(user)}"
@@ -296,8 +295,7 @@ class Checks:
             part = self.sections.teleoperation.get(name)
             if part is None or group not in robot.groups:
                 continue
-            assert isinstance(part.descriptor, TeleopDescriptor)
-            for key, does in part.descriptor.keys(part.component.options, robot.part(group)).items():
+            for key, does in part.component.options.terminal_keys(robot.part(group)).items():
                 other, meaning = known.setdefault(key, (name, does))
                 if meaning != does:
                     message = (
@@ -351,9 +349,8 @@ class Checks:
         faulty = any(key[:1] == ("transport",) for key in self.document.unread)
         if part is None or faulty or self.communicates or part.descriptor.type == "local":
             return
-        assert isinstance(part.descriptor, TransportDescriptor)
         inference = self.sections.inference.values()
-        used = part.descriptor.used(part.component.options) or any(e.component.uses_transport for e in inference)
+        used = part.component.options.used or any(e.component.uses_transport for e in inference)
         unknown = any(each.error.kind == InferenceConfig.plugin_kind for each in self.sections.missing)
         if not used and not unknown:
             message = f"nothing uses {part.descriptor.type!r}: no mode has an execution_mode that needs a transport"

@@ -12,7 +12,7 @@ from ibrobot_core.config.checks import streams
 from ibrobot_core.config.structure import ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.convert import Key
-from ibrobot_core.descriptors import StreamOptions
+from ibrobot_core.descriptors import Options, StreamOptions
 from ibrobot_core.errors import ContractError
 from ibrobot_core.options import did_you_mean
 from ibrobot_core.plugins import installed_plugins
@@ -129,7 +129,7 @@ class ContractChecks:
             return spec
         kind = kinds[str(spec.peripheral)]
         part = self.sections.peripherals.get(str(spec.peripheral))
-        without_plugin = schema.PeripheralConfig(type="", options=None, name=str(spec.peripheral), kind=kind)
+        without_plugin = schema.PeripheralConfig(type="", options=Options(), name=str(spec.peripheral), kind=kind)
         peripheral = part.component if part is not None and part.component.kind == kind else without_plugin
         if not peripheral.topic:
             if part is not None:  # otherwise its own fault is reported

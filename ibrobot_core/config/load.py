@@ -20,7 +20,7 @@ from ibrobot_core.config.secrets import check_known, expanded_again, public, war
 from ibrobot_core.config.structure import MODELS, ParsedComponent, ParsedSections, SectionParser
 from ibrobot_core.config.yaml_nodes import MAX_BYTES, Document, Place, parse_yaml
 from ibrobot_core.convert import shown
-from ibrobot_core.descriptors import SectionDescriptor
+from ibrobot_core.descriptors import Options, SectionDescriptor
 from ibrobot_core.errors import ConfigError, PluginNotInstalled, Problem
 from ibrobot_core.options import did_you_mean
 from ibrobot_core.plugins import Registry, installed_plugins
@@ -208,7 +208,7 @@ def _closed_ends(robot: Robot, sections: ParsedSections) -> dict[str, float | No
     lower = dict(zip(robot.joint_names, robot.lower.tolist(), strict=True))
     components = [part.component for part in sections.hardware.values()]
     return {
-        joint: lower[joint] if joint in each.anchored else None
+        joint: lower[joint] if joint in each.options.anchored else None
         for each in components
         for joint in each.joints or robot.joint_names
     }
@@ -226,7 +226,7 @@ def _not_installed(document: Document, sections: ParsedSections) -> dict[str, Pe
     """The peripherals without an installed plugin; they have no options."""
     items = [(each.error.type, document.get(*each.key)) for each in sections.missing if each.key[0] == "peripherals"]
     return {
-        item["name"]: PeripheralConfig(type=type_, options=None, name=item["name"], kind=item["kind"])
+        item["name"]: PeripheralConfig(type=type_, options=Options(), name=item["name"], kind=item["kind"])
         for type_, item in items
     }
 

@@ -13,11 +13,11 @@ def check_names(document: Document, sections: ParsedSections) -> None:
     publishers = _publishers(sections)
     peripherals = [str(item.get("name")) for _, item in document.items("peripherals")]
     for part in (*sections.active(), *sections.teleoperation.values()):
-        for option, topic in part.descriptor.publishes(part.component.options):
+        for option, topic in part.component.options.publishes():
             if topic in publishers:
                 document.add((*part.key, *option), f"{topic} is published by {publishers[topic]} already")
             publishers.setdefault(topic, document.dotted(part.key))
-        for option, name in part.descriptor.peripherals(part.component.options):
+        for option, name in part.component.options.peripherals():
             document.refer((*part.key, *option), name, peripherals, "peripheral")
 
 

@@ -256,7 +256,7 @@ class SectionParser:
         if options is None or descriptor is None:
             return None
         named = {} if name is None else {"name": name}
-        kept = {name: value for name, value in descriptor.kept(options).items() if name in attrs.fields_dict(kind)}
+        kept = {name: value for name, value in descriptor.kept().items() if name in attrs.fields_dict(kind)}
         try:
             return ParsedComponent(key, kind(**arguments, **named, **kept, options=options), descriptor)
         except TypeError:

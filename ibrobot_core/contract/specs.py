@@ -255,7 +255,7 @@ def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
     align = spec.align if has_header else attrs.evolve(spec.align, stamp="receive")
     if type_ == Image.ros_type:
         image = spec.image or ImageSpec()
-        size = peripheral.picture if peripheral is not None else None
+        size = peripheral.options.picture if peripheral is not None else None
         return ObservationPart(spec.key, spec.topic, type_, (), image, align, _image_feature(image, size))
     model = _model(config.robot, spec.select)
     return _vector(spec.key, spec.topic, type_, spec.select, align, model, config.robot.joint_names)

@@ -9,7 +9,6 @@ import attrs
 
 from ibrobot_core.component import CONTROL, Component, SourceWorker, TransportLink
 from ibrobot_core.config.missing import unavailable_modes
-from ibrobot_core.descriptors import TransportDescriptor
 from ibrobot_core.errors import ComponentFailed, NotSupported
 from ibrobot_core.interfaces.run import CommandSource
 from ibrobot_core.launch.absence import describe_absent
@@ -132,12 +131,9 @@ def build_plan(session: Session) -> LaunchPlan:
     if config.recording is not None:
         session.registry.require_episode_recorder()
     link = None
-    if (transport := config.transport) is not None:
-        descriptor = session.registry.find("transport", transport.type)
-        assert isinstance(descriptor, TransportDescriptor)
-        if elsewhere or descriptor.used(transport.options):
-            link = TransportLink(session, transport)
-            shared = descriptor.components(transport.options, session, link)
+    if (transport := config.transport) is not None and (elsewhere or transport.options.used):
+        link = TransportLink(session, transport)
+        shared = transport.options.components(session, link)
     added = mode_components(session, session.mode, link)
     components: list[Component] = [link] if link is not None else []
     components += added.models

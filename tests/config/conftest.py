@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import attrs
 import pytest
 
+from ibrobot_core.api import Options
 from ibrobot_core.config import RobotConfig, load_config
 from ibrobot_core.descriptors import (
     ConfigFile,
@@ -73,38 +74,44 @@ BASE = textwrap.dedent("""\
 
 
 @attrs.frozen
-class BusOptions:
+class BusOptions(Options):
     port: str = option(help="serial port")
     max_speed: float = option(3.0, unit="rad/s", gt=0, help="speed limit of the servos")
     baud: int = option(1_000_000, unit="Bd", ge=9600, help="speed of the bus")
     torque: bool = option(True, help="whether to hold")
-    calibration: Path | None = option(None, help="calibration file")
+    offsets: Path | None = option(None, help="calibration file", key="calibration")
     parity: Literal["none", "even"] = option("none", help="parity")
+
+    def devices(self) -> Mapping[str, str]:
+        return {"port": self.port}
 
 
 @attrs.frozen
-class WebcamOptions:
+class WebcamOptions(Options):
     device: int = option(0, help="index")
     width: int = option(640, unit="px", ge=1, help="width")
     fps: float = option(30.0, unit="Hz", gt=0, help="rate")
 
+    def devices(self) -> Mapping[str, str]:
+        return {"device": f"/dev/video{self.device}"}
+
 
 @attrs.frozen
-class VirtualOptions:
+class VirtualOptions(Options):
     width: int = option(640, unit="px", ge=1, help="width")
     fps: float = option(30.0, unit="Hz", gt=0, le=120, help="rate")
     shadows: bool = option(False, help="whether to render shadows")
 
 
 @attrs.frozen
-class NetOptions:
+class NetOptions(Options):
     layers: tuple[int, ...] = option((), help="sizes")
     gains: tuple[float, float] = option((1.0, 1.0), help="two gains")
     scale: float | str = option("auto", help="a number, or auto")
 
 
 @attrs.frozen
-class FarOptions:
+class FarOptions(Options):
     server: str = option("", help="where the model is")
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import attrs
 import pytest
 
+from ibrobot_core.api import Options
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.descriptors import TeleopDescriptor
 from ibrobot_core.errors import ConfigError
@@ -72,16 +73,21 @@ CASES = {
 
 
 @attrs.frozen
-class WiredOptions:
+class WiredOptions(Options):
     port: str = option(help="serial port")
     joint: str = option("", help="a joint that it moves")
     deadman: str = option("space", help="key of the deadman")
     stop: str = option("esc", help="key of the emergency stop")
 
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+        if self.joint and self.joint not in joints:
+            yield OptionFault(("joint",), f"no joint {self.joint!r}, only {', '.join(joints)}")
 
-def check(options: WiredOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
-    if options.joint and options.joint not in joints:
-        yield OptionFault(("joint",), f"no joint {options.joint!r}, only {', '.join(joints)}")
+    def devices(self) -> Mapping[str, str]:
+        return {"port": self.port}
+
+    def terminal_keys(self, robot: Robot) -> Mapping[str, str]:
+        return {self.deadman: "deadman", self.stop: "emergency stop"}
 
 
 @pytest.fixture
@@ -91,9 +97,6 @@ def registry(registry: Registry) -> Registry:
         lambda options, ctx: pytest.fail("it is only checked"),
         "a device",
         WiredOptions,
-        check_options=check,
-        devices=lambda options: {"port": options.port},
-        keys=lambda options, robot: {options.deadman: "deadman", options.stop: "emergency stop"},
     )
     registry.entries["teleop", "wired"] = Entry("teleop", wired, "fake", "ibrobot-plugin-fake", "1.0")
     return registry

@@ -155,7 +155,7 @@ def test_environment_and_home_are_expanded(load_text: Load, base: str, monkeypat
 
     assert options.port == "/dev/ttyACM7"
     assert options.baud == 115200
-    assert options.calibration == Path("/home/somebody/arm.json")
+    assert options.offsets == Path("/home/somebody/arm.json")
 
 
 def test_merge_keys_fill_in_what_is_not_given(load_text: Load, base: str) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import attrs
 import pytest
 
+from ibrobot_core.api import Options
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.descriptors import TeleopDescriptor
 from ibrobot_core.errors import ConfigError
@@ -20,51 +21,43 @@ Load = Callable[..., RobotConfig]
 
 
 @attrs.frozen
-class StickOptions:
+class StickOptions(Options):
     port: str = option("", help="serial port")
     inverted: tuple[str, ...] = option((), help="joints that turn the other way")
+
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+        for i, name in enumerate(self.inverted):
+            if name not in joints:
+                yield OptionFault(("inverted", i), f"unknown joint {name!r}{did_you_mean(name, joints, 'known')}")
+
+    def devices(self) -> Mapping[str, str]:
+        return {"port": self.port} if self.port else {}
 
 
 def never_made(options: Any, ctx: Any) -> Any:
     """The `make` of descriptors whose objects no test makes."""
 
 
-def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    for i, name in enumerate(options.inverted):
-        if name not in joints:
-            yield OptionFault(("inverted", i), f"unknown joint {name!r}{did_you_mean(name, joints, 'known')}")
-
-
-def _port(options: Any) -> Mapping[str, str]:
-    return {"port": options.port} if options.port else {}
-
-
-def _device(options: Any) -> Mapping[str, str]:
-    return {"device": f"/dev/video{options.device}"}
-
-
 @pytest.fixture(autouse=True)
 def checking(registry: Registry) -> None:
-    """The made-up plugins of these tests say what they open, and check their options."""
-    for key, devices in ((("hardware", "bus"), _port), (("sensor", "webcam"), _device)):
-        entry = registry.entries[key]
-        registry.entries[key] = attrs.evolve(entry, descriptor=attrs.evolve(entry.descriptor, devices=devices))
-    stick = TeleopDescriptor("stick", never_made, "a stick", StickOptions, check_options=_check, devices=_port)
+    """A made-up device that says what it opens, and checks its options."""
+    stick = TeleopDescriptor("stick", never_made, "a stick", StickOptions)
     registry.entries["teleop", "stick"] = Entry("teleop", stick, "fake", "ibrobot-plugin-fake", "1.0")
 
 
 ABSENT = "package://no_such_robot/arm.xml is in a package that is not installed: pip install no-such-robot"
 
 
-def _needs_model(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    if robot.description.mjcf is None:
-        yield OptionFault((), "a wand needs robot.description.mjcf: set it", "mjcf")
+class WandOptions(Options):
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+        if robot.description.mjcf is None:
+            yield OptionFault((), "a wand needs robot.description.mjcf: set it", "mjcf")
 
 
 @pytest.fixture
 def with_absent_model(base: str, registry: Registry) -> str:
     """A robot whose model is in a package that is not installed, with a device in mode `tool` that needs the model."""
-    wand = TeleopDescriptor("wand", never_made, "a wand", StickOptions, check_options=_needs_model)
+    wand = TeleopDescriptor("wand", never_made, "a wand", WandOptions)
     registry.entries["teleop", "wand"] = Entry("teleop", wand, "fake", "ibrobot-plugin-fake", "1.0")
     text = base.replace("    poses:", "    mjcf: package://no_such_robot/arm.xml\n    poses:", 1)
     text = text.replace("teleoperation:", "teleoperation:\n  tool: {type: wand}", 1)

@@ -9,6 +9,7 @@ import attrs
 import pytest
 import yaml
 
+from ibrobot_core.api import Options
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.show import to_yaml
 from ibrobot_core.descriptors import SectionDescriptor
@@ -28,7 +29,7 @@ class Box:
 
 
 @attrs.frozen
-class WorldOptions:
+class WorldOptions(Options):
     """What is around the robot."""
 
     table: bool = option(True, help="whether there is a table")
@@ -41,10 +42,9 @@ class WorldOptions:
         if self.table and self.padding > 1:
             raise ValueError("a table does not go with a padding above 1 m")
 
-
-def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    if options.tip not in robot.joint_names:
-        yield OptionFault(("tip",), f"no joint {options.tip!r}")
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+        if self.tip not in robot.joint_names:
+            yield OptionFault(("tip",), f"no joint {self.tip!r}")
 
 
 def _make(options: object, session: object) -> Any:
@@ -53,7 +53,7 @@ def _make(options: object, session: object) -> Any:
 
 @pytest.fixture(autouse=True)
 def world(registry: Registry) -> None:
-    section = SectionDescriptor("around", "what is around the robot", WorldOptions, make=_make, check_options=_check)
+    section = SectionDescriptor("around", "what is around the robot", WorldOptions, make=_make)
     registry.entries["section", "around"] = Entry("section", section, "fake", "ibrobot-plugin-fake", "1.0")
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from ibrobot_testing.contexts import ARM, GRIPPER, make_robot
 
-from ibrobot_core.options import NoOptions
+from ibrobot_core.descriptors import Options
 from ibrobot_core.schema import (
     ActionSpec,
     Align,
@@ -20,6 +20,11 @@ from ibrobot_core.schema import (
     PeripheralConfig,
     RobotConfig,
 )
+
+
+class PictureOptions(Options):
+    picture = (4, 6)
+
 
 STATE = ObservationSpec("observation.state", topic="/joint_states")
 TOP = ObservationSpec(
@@ -40,14 +45,14 @@ def make_config(
     rate_hz: float = 30.0,
 ) -> RobotConfig:
     executors = {
-        "arm_position": ExecutorConfig("position", NoOptions(), "arm_position", "arm", ARM),
-        "gripper_position": ExecutorConfig("position", NoOptions(), "gripper_position", "gripper", GRIPPER),
-        "whole_position": ExecutorConfig("position", NoOptions(), "whole_position", "all", GRIPPER + ARM),
+        "arm_position": ExecutorConfig("position", Options(), "arm_position", "arm", ARM),
+        "gripper_position": ExecutorConfig("position", Options(), "gripper_position", "gripper", GRIPPER),
+        "whole_position": ExecutorConfig("position", Options(), "whole_position", "all", GRIPPER + ARM),
     }
     peripherals = {
-        "top": PeripheralConfig("webcam", NoOptions(), "top", "camera", picture=(4, 6)),
-        "wrist": PeripheralConfig("webcam", NoOptions(), "wrist", "camera"),
-        "chest": PeripheralConfig("gyro", NoOptions(), "chest", "imu"),
+        "top": PeripheralConfig("webcam", PictureOptions(), "top", "camera"),
+        "wrist": PeripheralConfig("webcam", Options(), "wrist", "camera"),
+        "chest": PeripheralConfig("gyro", Options(), "chest", "imu"),
     }
     return RobotConfig(
         robot=make_robot(),

@@ -12,11 +12,11 @@ from ibrobot_testing.contexts import START_NS
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.contract.specs import Contract
+from ibrobot_core.descriptors import Options
 from ibrobot_core.dispatch.dispatcher import Dispatcher
 from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient
 from ibrobot_core.interfaces import PolicySpec
 from ibrobot_core.messages import Header, JointState
-from ibrobot_core.options import NoOptions
 from ibrobot_core.schema import (
     ActionSpec,
     Align,
@@ -63,7 +63,7 @@ def make_contract(safety_behavior: str) -> Contract:
     action = ActionSpec(executor="all", topic="/commands", safety_behavior=safety_behavior)
     config = RobotConfig(
         robot=ROBOT,
-        executors={"all": ExecutorConfig("position", NoOptions(), "all", "all", ROBOT.joint_names)},
+        executors={"all": ExecutorConfig("position", Options(), "all", "all", ROBOT.joint_names)},
         control_modes={"idle": ControlMode(())},
         default_control_mode="idle",
         contract=ContractConfig(rate_hz=10.0, observations=(state,), actions=(action,)),

@@ -158,9 +158,9 @@ def calibrations(config: RobotConfig) -> dict[str, dict[str, dict[str, Any]]]:
         CalibrationError: if a calibration cannot be read.
     """
     return {
-        name: with_closed_ends(load_calibration(each.calibration, each.joints).snapshot(), config)
+        name: with_closed_ends(load_calibration(each.options.calibration, each.joints).snapshot(), config)
         for name, each in config.hardware.items()
-        if each.calibration is not None
+        if each.options.calibration is not None
     }
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from ibrobot_calibration.calibration import load_calibration
 from ibrobot_calibration.joint_units import JointUnits, calibrations, policy_units, with_closed_ends
-from ibrobot_core.api import CalibrationError, Contract
+from ibrobot_core.api import CalibrationError, Contract, Options
 from ibrobot_core.app import ModelConfig, Problem, RobotConfig
 
 
@@ -30,19 +30,19 @@ def uncalibrated(config: RobotConfig) -> Iterator[Problem]:
     used = {*mode.devices.values(), *(mode.inference.devices.values() if mode.inference is not None else ())}
     for name, arm in config.hardware.items():
         path = "hardware" if name == "hardware" else f"hardware.{name}"
-        yield from _faults(config, path, arm.calibration, arm.joints, arm.tool)
+        yield from _faults(config, path, arm.options, arm.joints)
     for name in (each for each in config.teleoperation if each in used):
         device = config.teleoperation[name]
-        yield from _faults(config, f"teleoperation.{name}", device.calibration, None, device.tool)
+        yield from _faults(config, f"teleoperation.{name}", device.options, None)
 
 
-def _faults(
-    config: RobotConfig, path: str, name: str | None, joints: Sequence[str] | None, tool: str | None
-) -> Iterator[Problem]:  # fmt: skip
-    if name is None:
+def _faults(config: RobotConfig, path: str, options: Options, joints: Sequence[str] | None) -> Iterator[Problem]:
+    if options.calibration is None:
         return
     limits = {joint.name: (joint.lower, joint.upper) for joint in config.robot.joints}
     try:
-        load_calibration(name, joints, tool=tool).check_ranges(limits, config.closed_ends)
+        load_calibration(options.calibration, joints, tool=options.calibrated_by).check_ranges(
+            limits, config.closed_ends
+        )
     except CalibrationError as error:
         yield Problem(config.source, 0, path, str(error))

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from ibrobot_calibration import Calibration, JointCalibration
 from ibrobot_calibration.joint_units import JointUnits, calibrations, with_closed_ends
 
-from ibrobot_core.api import CalibrationError, Contract, HardwareDescriptor, option
+from ibrobot_core.api import CalibrationError, Contract, HardwareDescriptor, Options, option
 from ibrobot_core.app import RobotConfig, load_config
 from ibrobot_core.plugins import Entry, discover
 
@@ -48,9 +48,17 @@ ANGLE = 0.1
 
 
 @attrs.frozen
-class ForeignOptions:
+class ForeignOptions(Options):
     offsets: str = option(help="file with what other arms call a calibration")
     closes: tuple[str, ...] = option((), help="joints that are closed at their lower limit")
+
+    @property
+    def calibration(self) -> str:
+        return self.offsets
+
+    @property
+    def anchored(self) -> tuple[str, ...]:
+        return self.closes
 
 
 def never_made(options: Any, ctx: Any) -> Any:
@@ -67,8 +75,6 @@ def foreign(tmp_path: Path) -> Callable[[str], RobotConfig]:
             never_made,
             "an arm",
             ForeignOptions,
-            calibration=lambda options: options.offsets,
-            anchored=lambda options: options.closes,
         ),
         HardwareDescriptor("stick", never_made, "a stick"),
     )

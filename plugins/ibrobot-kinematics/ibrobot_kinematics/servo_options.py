@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import attrs
 
-from ibrobot_core.api import documented, option
+from ibrobot_core.api import Options, documented, option
 
 
 @documented
 @attrs.frozen
-class ServoOptions:
+class ServoOptions(Options):
     """Limits of twists, and when the tool slows down and stops."""
 
     timeout: float = option(0.1, unit="s", gt=0, le=1, help="how long a twist is valid; then the tool slows to a stop")

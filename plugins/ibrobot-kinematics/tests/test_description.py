@@ -14,7 +14,7 @@ from ibrobot_kinematics.description import DescriptionPublisher
 from ibrobot_kinematics.hooks import ibrobot_sections
 from ibrobot_testing import SectionSuite, check_descriptor, make_robot, make_session
 
-from ibrobot_core.api import HardwareDescriptor, Header, JointState, NoOptions, SensorDescriptor, TFMessage
+from ibrobot_core.api import HardwareDescriptor, Header, JointState, Options, SensorDescriptor, TFMessage
 from ibrobot_core.app import Component, ConfigError, Registry, RobotConfig, Session, installed_plugins, load_config
 
 URDF = textwrap.dedent("""\
@@ -58,7 +58,7 @@ class TestDescriptionPublisher(SectionSuite):
 
 def test_descriptor_is_complete() -> None:
     _, descriptor = ibrobot_sections()
-    check_descriptor(descriptor, NoOptions())
+    check_descriptor(descriptor, Options())
 
 
 @pytest.fixture

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from ibrobot_kinematics import KinematicModel, ServoStatus, robot_model
 from ibrobot_kinematics.clearance import CLEARANCE, Configuration
-from ibrobot_kinematics.hooks import ibrobot_sections, ibrobot_teleop
-from ibrobot_kinematics.options import TwistOptions
+from ibrobot_kinematics.options import ToolPoseOptions, TwistOptions
 from ibrobot_kinematics.twist import TwistTeleop
 from ibrobot_testing import TeleopSuite, host_context, make_robot
 from ibrobot_testing.contexts import START_NS, SetClock
@@ -356,8 +355,7 @@ def test_options_that_make_no_sense_are_refused(options, message):
 
 
 def faults(robot: Robot, options: TwistOptions = TwistOptions()) -> list[str]:  # noqa: B008 - it is frozen
-    (descriptor,) = ibrobot_teleop()
-    return [fault.message for fault in descriptor.check_options(options, robot, ())]
+    return [fault.message for fault in options.check(robot, ())]
 
 
 def test_options_are_checked_against_the_robot(model):
@@ -365,8 +363,7 @@ def test_options_are_checked_against_the_robot(model):
     assert faults(make_robot()) == ["twists move a tool, which needs robot.description.mjcf: set it"]
     same = "'tool' is robot.description.tip; give the name of the base frame"
     assert faults(robot_of(model), TwistOptions(frame="tool")) == [same]
-    section, _ = ibrobot_sections()
-    (fault,) = section.check_options(section.options(), make_robot(), ())
+    (fault,) = ToolPoseOptions().check(make_robot(), ())
     assert fault.message == "the pose of the tool needs robot.description.mjcf: set it"
 
 

@@ -48,7 +48,7 @@ class RobotFeatures:
         """
         contract, robot = Contract.from_config(config), config.robot
         joints = contract.action_joints
-        names = [calibration] if calibration else [each.calibration for each in config.hardware.values()]
+        names = [calibration] if calibration else [each.options.calibration for each in config.hardware.values()]
         known: dict[str, JointCalibration] = {}
         for name in names if calibration or not config.simulated else []:
             if name is not None:

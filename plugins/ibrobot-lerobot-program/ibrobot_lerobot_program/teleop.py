@@ -11,7 +11,7 @@ import numpy as np
 from ibrobot_core.api import (
     Context,
     JointReading,
-    NoOptions,
+    Options,
     RealClock,
     Robot,
     Teleop,
@@ -106,7 +106,7 @@ class ProgramTeleop:
         """The keys of the terminal."""
         registry, name = installed_plugins(), "terminal"
         context = Context.of(self._config, name, self._clock)
-        keys: RunTerminal = registry.create(name, registry.default(name), NoOptions(), context)
+        keys: RunTerminal = registry.create(name, registry.default(name), Options(), context)
         return keys
 
     def read(self) -> dict[str, float]:

@@ -3,28 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
 
 from ibrobot_terminal import GuideDescriptor
 
-from ibrobot_camera.device import realsense_stream, require_device, video_device
-from ibrobot_camera.options import OpenCvOptions, RealSenseOptions, picture_size
-from ibrobot_core.api import Check, DecoderDescriptor, Late, OptionFault, SensorDescriptor, SensorError, hookimpl
+from ibrobot_camera.options import OpenCvOptions, RealSenseOptions
+from ibrobot_core.api import Check, DecoderDescriptor, Late, SensorDescriptor, hookimpl
 from ibrobot_core.app import Command
-
-if TYPE_CHECKING:
-    from ibrobot_core.api import Robot
-
-
-def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    """Check that the calibration file can be read."""
-    if options.info is not None:
-        from ibrobot_camera.calibration import load_info
-
-        try:
-            load_info(options.info)
-        except SensorError as error:
-            yield OptionFault(("info",), str(error))
 
 
 @hookimpl
@@ -34,10 +18,6 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
         type="opencv",
         options=OpenCvOptions,
         make=Late("ibrobot_camera.camera:OpenCvCamera"),
-        devices=video_device,
-        picture=picture_size,
-        check_options=_check,
-        find=require_device,
         summary="V4L2 device, RTSP or HTTP stream, or video file",
     )
     yield SensorDescriptor(
@@ -45,8 +25,6 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
         options=RealSenseOptions,
         make=Late("ibrobot_camera.realsense:RealSenseCamera"),
         check=Late("ibrobot_camera.librealsense:load_library"),
-        devices=realsense_stream,
-        picture=picture_size,
         summary="Intel RealSense: colour, or aligned depth",
     )
 

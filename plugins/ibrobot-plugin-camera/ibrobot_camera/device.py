@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import attrs
 
-from ibrobot_camera.options import OpenCvOptions, RealSenseOptions
-from ibrobot_core.api import MissingDependency, SensorError
+from ibrobot_core.api import SensorError
 
 BY_ID = Path("/dev/v4l/by-id")
 BY_PATH = Path("/dev/v4l/by-path")
@@ -67,32 +64,3 @@ def _stable() -> str:
         there = ", ".join(sorted(entry.name for entry in folder.iterdir())) if folder.is_dir() else "none"
         known.append(f"devices under {folder}: {there}")
     return "; ".join(known)
-
-
-def video_device(options: OpenCvOptions) -> Mapping[str, str]:
-    """The resolved path of a V4L2 device; streams and files can be opened more than once."""
-    try:
-        device = find_device(options.device)
-    except SensorError:
-        return {}
-    return {"device": os.path.realpath(device.target)} if device.kind == "v4l2" else {}
-
-
-def require_device(options: OpenCvOptions) -> None:
-    """Look for the V4L2 device or the video file that the options name.
-
-    Raises:
-        MissingDependency: if it is not there.
-    """
-    try:
-        device = find_device(options.device)
-    except SensorError as error:
-        raise MissingDependency(str(error), remedy=LIST) from None
-    if device.kind == "v4l2" and not os.path.exists(device.target):
-        raise MissingDependency(f"{device.target}: {NO_DEVICE}", remedy=LIST)
-
-
-def realsense_stream(options: RealSenseOptions) -> Mapping[str, str]:
-    """The camera and its stream; colour and depth of one camera are separate peripherals."""
-    camera = f"RealSense {options.serial}" if options.serial else "the only RealSense"
-    return {"serial": f"the {options.stream} stream of {camera}"}

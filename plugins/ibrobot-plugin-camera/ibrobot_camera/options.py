@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import attrs
 
-from ibrobot_core.api import documented, option
+from ibrobot_camera.device import LIST, NO_DEVICE, find_device
+from ibrobot_core.api import MissingDependency, OptionFault, Options, SensorError, documented, option
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Robot
 
 ENCODING = option(
     "jpeg",
@@ -18,7 +25,7 @@ JPEG_QUALITY = option(90, ge=1, le=100, help="JPEG quality of images that the ca
 
 @documented
 @attrs.frozen
-class OpenCvOptions:
+class OpenCvOptions(Options):
     """Options of `type: opencv`: a V4L2 device, a network stream, or a video file."""
 
     device: int | str = option(
@@ -49,10 +56,48 @@ class OpenCvOptions:
         if self.fourcc is not None and len(self.fourcc) != 4:
             raise ValueError(f"fourcc must have four characters, e.g. MJPG, not {self.fourcc!r}")
 
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+        """Check that the calibration file can be read."""
+        if self.info is not None:
+            from ibrobot_camera.calibration import load_info
+
+            try:
+                load_info(self.info)
+            except SensorError as error:
+                yield OptionFault(("info",), str(error))
+
+    def devices(self) -> Mapping[str, str]:
+        """The resolved path of a V4L2 device; streams and files can be opened more than once."""
+        try:
+            device = find_device(self.device)
+        except SensorError:
+            return {}
+        return {"device": os.path.realpath(device.target)} if device.kind == "v4l2" else {}
+
+    def find_device(self) -> None:
+        """Look for the V4L2 device or the video file.
+
+        Raises:
+            MissingDependency: if it is not there.
+        """
+        try:
+            device = find_device(self.device)
+        except SensorError as error:
+            raise MissingDependency(str(error), remedy=LIST) from None
+        if device.kind == "v4l2" and not os.path.exists(device.target):
+            raise MissingDependency(f"{device.target}: {NO_DEVICE}", remedy=LIST)
+
+    @property
+    def picture(self) -> tuple[int, int] | None:
+        """Height and width of the images [px]; None if only the source knows them."""
+        if self.height is None or self.width is None:
+            return None
+        return self.height, self.width
+
 
 @documented
 @attrs.frozen
-class RealSenseOptions:
+class RealSenseOptions(Options):
     """Options of `type: realsense`, which needs the extra `realsense` of this package."""
 
     serial: str = option("", help="serial number; if empty, the only connected camera")
@@ -64,9 +109,12 @@ class RealSenseOptions:
     jpeg_quality: int = JPEG_QUALITY
     frame_id: str = option("", help="frame id of the messages; NAME_optical_frame if empty")
 
+    def devices(self) -> Mapping[str, str]:
+        """The stream of the camera."""
+        camera = f"RealSense {self.serial}" if self.serial else "the only RealSense"
+        return {"serial": f"the {self.stream} stream of {camera}"}
 
-def picture_size(options: OpenCvOptions | RealSenseOptions) -> tuple[int, int] | None:
-    """Height and width of the images [px]; None if only the source knows them."""
-    if options.height is None or options.width is None:
-        return None
-    return options.height, options.width
+    @property
+    def picture(self) -> tuple[int, int]:
+        """Height and width of the images [px]."""
+        return self.height, self.width

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from ibrobot_camera import capture as capture_module
 from ibrobot_camera import device as device_module
-from ibrobot_camera import ibrobot_sensors
 from ibrobot_camera.camera import OpenCvCamera, to_image
 from ibrobot_camera.capture import Capture
 from ibrobot_camera.commands.sources import decoded
@@ -365,10 +364,9 @@ class TestDevices:
         ],
     )
     def test_a_run_learns_beforehand_what_is_not_connected(self, device: int | str, message: str) -> None:
-        [descriptor] = [each for each in ibrobot_sensors() if each.type == "opencv"]
         with pytest.raises(MissingDependency, match=message):
-            descriptor.find(OpenCvOptions(device=device))
-        descriptor.find(OpenCvOptions(device="rtsp://host/live"))
+            OpenCvOptions(device=device).find_device()
+        OpenCvOptions(device="rtsp://host/live").find_device()
 
 
 def test_depth_is_16uc1_with_its_bytes() -> None:

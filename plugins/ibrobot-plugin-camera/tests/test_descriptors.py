@@ -17,17 +17,13 @@ def test_descriptors_say_what_the_options_say(options: OpenCvOptions | RealSense
 
 
 def test_the_size_of_pictures_is_height_and_width() -> None:
-    (descriptor,) = (each for each in ibrobot_camera.ibrobot_sensors() if each.type == "opencv")
-    assert descriptor.picture(OpenCvOptions("0", width=64, height=48)) == (48, 64)
+    assert OpenCvOptions("0", width=64, height=48).picture == (48, 64)
 
 
 def test_only_a_v4l2_device_is_one_that_two_may_not_open(tmp_path: Path) -> None:
-    (descriptor,) = (each for each in ibrobot_camera.ibrobot_sensors() if each.type == "opencv")
     video = tmp_path / "pick.mp4"
     video.touch()
-    used = [
-        descriptor.devices(OpenCvOptions(source)) for source in (7, "/dev/video7", str(video), "rtsp://a/b", "none")
-    ]
+    used = [OpenCvOptions(source).devices() for source in (7, "/dev/video7", str(video), "rtsp://a/b", "none")]
     assert used == [{"device": "/dev/video7"}] * 2 + [{}] * 3
 
 
@@ -41,12 +37,11 @@ def test_only_a_v4l2_device_is_one_that_two_may_not_open(tmp_path: Path) -> None
     ],
 )
 def test_a_calibration_that_cannot_be_used_is_found_before_a_run(tmp_path: Path, text: str | None, wrong: str) -> None:
-    (descriptor,) = (each for each in ibrobot_camera.ibrobot_sensors() if each.type == "opencv")
     if text is not None:
         (tmp_path / "top.yaml").write_text(text)
     options = OpenCvOptions("0", info=tmp_path / "top.yaml")
     robot = host_context().robot
-    (fault,) = descriptor.check_options(options, robot, robot.joint_names)
+    (fault,) = options.check(robot, robot.joint_names)
     assert fault.option == ("info",)
     assert fault.message.startswith(f"{tmp_path}/top.yaml: ")
     assert wrong in fault.message

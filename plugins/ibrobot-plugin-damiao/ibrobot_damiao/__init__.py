@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from ibrobot_core.api import HardwareDescriptor, Late, hookimpl
 from ibrobot_core.app import Command
-from ibrobot_damiao.options import DamiaoOptions, can_channel, check_motors
+from ibrobot_damiao.options import DamiaoOptions
 
 
 @hookimpl
@@ -18,8 +18,6 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
         make=Late("ibrobot_damiao.arm:DamiaoArm"),
         torque_off="ibrobot damiao off",
         summary="arm with Damiao motors on a CAN bus, as OpenArm or reBot B601",
-        check_options=check_motors,
-        devices=can_channel,
     )
 
 

@@ -22,7 +22,7 @@ from ibrobot_core.api import (
     seconds,
 )
 from ibrobot_damiao.bus import BusError, Channel, DamiaoBus, NoAnswer, TorqueStaysOn
-from ibrobot_damiao.options import DamiaoOptions, check_motors
+from ibrobot_damiao.options import DamiaoOptions
 from ibrobot_damiao.protocol import CLEAR_ERROR, ENABLE, ERRORS, MIT, MODE, ON, Feedback, MitCommand, command
 
 _ANSWERS = 0.4
@@ -55,7 +55,7 @@ class DamiaoArm(Hardware):
     """
 
     def __init__(self, options: DamiaoOptions, ctx: Context) -> None:
-        for fault in check_motors(options, ctx.robot, ctx.joints):
+        for fault in options.check(ctx.robot, ctx.joints):
             raise HardwareError(f"{ctx.name}: {'.'.join(map(str, fault.option))}: {fault.message}")
         self.joints = ctx.joints
         self._options = options

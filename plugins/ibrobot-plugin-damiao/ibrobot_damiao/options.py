@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import attrs
 
-from ibrobot_core.api import OptionFault, did_you_mean, documented, not_empty, option
+from ibrobot_core.api import OptionFault, Options, did_you_mean, documented, not_empty, option
 from ibrobot_damiao.protocol import DEFAULT_BITRATE, MAX_KD, MAX_KP
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ class MotorOptions:
 
 @documented
 @attrs.frozen
-class DamiaoOptions:
+class DamiaoOptions(Options):
     """Options of `type: damiao`: an arm whose joints are Damiao motors on one CAN bus, in MIT mode."""
 
     channel: str = option(
@@ -57,20 +57,18 @@ class DamiaoOptions:
     warning_temperature: float = option(70.0, unit="deg C", gt=0, le=150, help="a motor above it causes a warning")
     max_temperature: float = option(90.0, unit="deg C", gt=0, le=150, help="a motor above it causes a fault")
 
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+        """Check that each joint has a motor, and each motor a joint and an id of its own."""
+        for joint in self.motors:
+            if joint not in joints:
+                yield OptionFault(("motors", joint), f"unknown joint {joint!r}{did_you_mean(joint, joints, 'known')}")
+        if missing := [joint for joint in joints if joint not in self.motors]:
+            yield OptionFault(("motors",), f"no motor for joint {missing[0]!r}; give it one: {missing[0]}: {{id: ID}}")
+        owners: dict[int, str] = {}
+        for joint, motor in self.motors.items():
+            if (owner := owners.setdefault(motor.id, joint)) != joint:
+                yield OptionFault(("motors", joint, "id"), f"motor {motor.id} belongs to {owner} already")
 
-def check_motors(options: DamiaoOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
-    """Check that each joint has a motor, and each motor a joint and an id of its own."""
-    for joint in options.motors:
-        if joint not in joints:
-            yield OptionFault(("motors", joint), f"unknown joint {joint!r}{did_you_mean(joint, joints, 'known')}")
-    if missing := [joint for joint in joints if joint not in options.motors]:
-        yield OptionFault(("motors",), f"no motor for joint {missing[0]!r}; give it one: {missing[0]}: {{id: ID}}")
-    owners: dict[int, str] = {}
-    for joint, motor in options.motors.items():
-        if (owner := owners.setdefault(motor.id, joint)) != joint:
-            yield OptionFault(("motors", joint, "id"), f"motor {motor.id} belongs to {owner} already")
-
-
-def can_channel(options: DamiaoOptions) -> Mapping[str, str]:
-    """The bus, which one component has at a time: a network interface, or the resolved path of a port."""
-    return {"channel": os.path.realpath(options.channel) if options.channel.startswith("/") else options.channel}
+    def devices(self) -> Mapping[str, str]:
+        """The bus, which one component has at a time: a network interface, or the resolved path of a port."""
+        return {"channel": os.path.realpath(self.channel) if self.channel.startswith("/") else self.channel}

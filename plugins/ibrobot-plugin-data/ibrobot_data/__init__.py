@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ibrobot_core.api import Late, hookimpl
+from ibrobot_core.api import Check, Late, hookimpl
 from ibrobot_core.app import Command, SectionDescriptor, SourceDescriptor
 from ibrobot_data.conversion import EVENTS
 from ibrobot_data.options import EpisodesOptions, check_keys
@@ -13,6 +15,8 @@ from ibrobot_data.recording_session import Session as SessionEvent
 
 if TYPE_CHECKING:
     from ibrobot_core.app import Component, RecordedRun, RobotConfig
+
+_LEAST_FREE_BYTES = 2_000_000_000
 
 
 @hookimpl
@@ -49,6 +53,14 @@ def _recording(options: EpisodesOptions | None, session: RecordedRun) -> Compone
 
 def _records(config: RobotConfig) -> bool:
     return config.recording is not None
+
+
+@hookimpl
+def ibrobot_doctor() -> Iterable[Check]:
+    """Check the disk space for recordings."""
+    free = shutil.disk_usage(".").free
+    remedy = f"free at least {_LEAST_FREE_BYTES / 1e9:.0f} GB, or record elsewhere with recording.root"
+    yield Check("disk", free >= _LEAST_FREE_BYTES, f"{free / 1e9:.1f} GB free in {os.path.abspath('.')}", remedy)
 
 
 @hookimpl

@@ -337,9 +337,9 @@ def _can_begin(run: RecordedRun) -> bool:
         assert isinstance(shown_by, ViewerDescriptor)
         if shown_by.begins_episodes:
             return True
-    others = [(each.offers, options) for each, options in run.registry.sections(run.config) if options is not None]
-    if (transport := run.config.transport) is not None:
-        others.append((run.registry.find("transport", transport.type).offers, transport.options))
-    if any(offers(options, service.name) for offers, options in others for service in (START, RECORD)):
+    doors = [section.options for section in run.config.plugin_sections.values()]
+    if run.config.transport is not None:
+        doors.append(run.config.transport.options)
+    if any(door.offers(service.name) for door in doors for service in (START, RECORD)):
         return True
     return has_button(run, run.config.control_modes[run.mode].devices.values(), "start")

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import attrs
 
-from ibrobot_core.api import OptionFault, TeleopDescriptor, documented, option
-from ibrobot_core.app import AGENT_LOG, RUN_KEYS, check_key, installed_plugins
+from ibrobot_core.api import OptionFault, Options, documented, option
+from ibrobot_core.app import AGENT_LOG, RUN_KEYS, check_key
 
 if TYPE_CHECKING:
     from ibrobot_core.app import RobotConfig, RunView
@@ -30,7 +30,7 @@ def _check_key(_: object, __: object, key: str) -> None:
 
 @documented
 @attrs.frozen
-class EpisodesOptions:
+class EpisodesOptions(Options):
     """Options of the section `episodes`: how an operator corrects a policy, and which parts of a run are kept."""
 
     takeover: str = option(
@@ -64,13 +64,7 @@ def options_of(config: RobotConfig) -> EpisodesOptions:
 
 def has_button(run: RunView, devices: Iterable[str], event: str) -> bool:
     """Whether one of these teleoperation devices of a run has a button for an event."""
-    for name in devices:
-        device = run.config.teleoperation[name]
-        descriptor = run.registry.find("teleop", device.type)
-        assert isinstance(descriptor, TeleopDescriptor)
-        if event in descriptor.events(device.options):
-            return True
-    return False
+    return any(event in run.config.teleoperation[name].options.events() for name in devices)
 
 
 def check_keys(config: RobotConfig) -> Iterator[OptionFault]:
@@ -92,11 +86,9 @@ def check_keys(config: RobotConfig) -> Iterator[OptionFault]:
         assert mode.inference is not None
         for group, name in mode.inference.devices.items():
             device = config.teleoperation.get(name)
-            entry = installed_plugins().entries.get(("teleop", device.type)) if device is not None else None
-            if device is None or entry is None:
+            if device is None:
                 continue
-            assert isinstance(entry.descriptor, TeleopDescriptor)
-            used = entry.descriptor.keys(device.options, config.robot.part(group) if group else config.robot)
+            used = device.options.terminal_keys(config.robot.part(group) if group else config.robot)
             for option_, (key, does) in keys.items():
                 if key in used:
                     message = f"{key!r} is {used[key]} of {name} in mode {mode.name}, where it also {does}"

@@ -13,6 +13,8 @@ from ibrobot_core.api import (
     EpisodeSetup,
     HardwareDescriptor,
     JointReading,
+    OperatorEvent,
+    Options,
     PolicyDescriptor,
     RecorderDescriptor,
     TeleopCommand,
@@ -66,6 +68,12 @@ class Stick(FakeTeleop):
         return attrs.evolve(super().read(measured), approaching=self.approaching)
 
 
+class PadOptions(Options):
+    @override
+    def events(self) -> tuple[OperatorEvent, ...]:
+        return ("start", "success")
+
+
 @hookimpl
 def ibrobot_hardware() -> Iterator[HardwareDescriptor]:
     yield HardwareDescriptor("scene", lambda options, ctx: Scene(ctx), "a scene", simulated=True)
@@ -76,7 +84,7 @@ def ibrobot_hardware() -> Iterator[HardwareDescriptor]:
 def ibrobot_teleop() -> Iterator[TeleopDescriptor]:
     yield TeleopDescriptor("stick", lambda options, ctx: Stick(ctx), "a stick")
     pad = lambda options, ctx: Stick(ctx)  # noqa: E731
-    yield TeleopDescriptor("pad", pad, "a stick with buttons", events=lambda options: ("start", "success"))
+    yield TeleopDescriptor("pad", pad, "a stick with buttons", PadOptions)
 
 
 @hookimpl
@@ -87,6 +95,12 @@ def ibrobot_policies() -> Iterator[PolicyDescriptor]:
 @hookimpl
 def ibrobot_recorders() -> Iterator[RecorderDescriptor]:
     yield RecorderDescriptor("lines", lambda options, ctx: FakeRecorder(ctx), "lines of JSON")
+
+
+class PhoneOptions(Options):
+    @override
+    def offers(self, service: str) -> bool:
+        return service == "/record_episode"
 
 
 class Phone(Component):
@@ -103,7 +117,7 @@ def ibrobot_sections() -> Iterator[SectionDescriptor]:
         type="phone",
         make=lambda options, session: Phone("phone", "a phone"),
         summary="a phone",
-        offers=lambda options, service: service == "/record_episode",
+        options=PhoneOptions,
     )
 
 

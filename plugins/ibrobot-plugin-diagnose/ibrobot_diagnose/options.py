@@ -8,7 +8,7 @@ from typing import override
 import attrs
 from ibrobot_provenance.work_options import on_option
 
-from ibrobot_core.api import documented, option
+from ibrobot_core.api import Options, documented, option
 from ibrobot_core.app import Event, Shown
 
 KIND = "explanation"
@@ -134,7 +134,7 @@ SECTION = "preflight"
 
 @documented
 @attrs.frozen
-class PreflightSection:
+class PreflightSection(Options):
     """Options of the section `preflight`."""
 
     against: Path | None = option(

@@ -9,16 +9,7 @@ from ibrobot_terminal import GuideDescriptor, PanelDescriptor
 
 from ibrobot_core.api import Check, Descriptor, HardwareDescriptor, Late, SensorDescriptor, TeleopDescriptor, hookimpl
 from ibrobot_core.app import Command
-from ibrobot_feetech.options import (
-    TOOL,
-    EmulatedSignalOptions,
-    FollowerOptions,
-    LeaderOptions,
-    check_follower,
-    check_leader,
-    leader_keys,
-    serial_port,
-)
+from ibrobot_feetech.options import EmulatedSignalOptions, FollowerOptions, LeaderOptions
 
 
 @hookimpl(optionalhook=True)
@@ -80,11 +71,6 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
         make=Late("ibrobot_feetech.follower:FeetechFollower"),
         torque_off="ibrobot feetech torque off",
         summary="SO-101 arm: STS3215 servos on one bus",
-        check_options=check_follower,
-        devices=serial_port,
-        calibration=lambda options: options.calibration,
-        tool=TOOL,
-        anchored=lambda options: options.anchored,
     )
 
 
@@ -108,13 +94,7 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         options=LeaderOptions,
         make=Late("ibrobot_feetech.leader:LeaderTeleop"),
         summary="SO-101 leader arm, moved by hand",
-        check_options=check_leader,
-        devices=serial_port,
-        calibration=lambda options: options.calibration,
-        tool=TOOL,
-        keys=leader_keys,
         label="follow the leader arm",
-        needs_terminal=lambda options: options.deadman != "none",
     )
 
 

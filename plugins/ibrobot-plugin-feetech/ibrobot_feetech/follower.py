@@ -34,7 +34,7 @@ from ibrobot_feetech.bus import RETURN_DELAY_S, FeetechBus
 from ibrobot_feetech.errors import FeetechError, NoReply, Place, PortError, ServoFault, TorqueStaysOn
 from ibrobot_feetech.health import Health, Measured, SteadyLoad
 from ibrobot_feetech.opening import open_port
-from ibrobot_feetech.options import TOOL, FollowerOptions, check_follower
+from ibrobot_feetech.options import TOOL, FollowerOptions
 from ibrobot_feetech.port import emulate
 from ibrobot_feetech.protocol import OVER_CURRENT, OVERLOAD, faults
 from ibrobot_feetech.supply import supply
@@ -75,7 +75,7 @@ class FeetechFollower(Hardware):
         self._ctx = ctx
         order = ctx.robot.indices(ctx.joints)
         lower = dict(zip(ctx.joints, ctx.robot.lower[order], strict=True))
-        for fault in check_follower(options, ctx.robot, ctx.joints):
+        for fault in options.check(ctx.robot, ctx.joints):
             raise HardwareError(f"{ctx.name}: {fault.option[0]}: {fault.message}")
         try:
             calibration = load_calibration(options.calibration, ctx.joints, tool=TOOL)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import attrs
 
-from ibrobot_core.api import HardwareError, OptionFault, did_you_mean, documented, not_empty, option
+from ibrobot_core.api import HardwareError, OptionFault, Options, did_you_mean, documented, not_empty, option
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
@@ -21,7 +21,7 @@ _GRIPPER = ("gripper",)
 
 @documented
 @attrs.frozen
-class FollowerOptions:
+class FollowerOptions(Options):
     """Options of `type: feetech_so101`: an arm whose joints are STS3215 servos on one bus."""
 
     port: str = option(
@@ -78,10 +78,25 @@ class FollowerOptions:
     )
     write_calibration: bool = option(False, help="at the start, write the calibration to servos that differ")
 
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+        """Check that the joints in the self exist; they may belong to another component of the robot."""
+        for key, names in (("anchored", self.anchored), ("gentle", self.gentle)):
+            if names != _GRIPPER:
+                yield from _unknown(key, names, robot.joint_names, "joint")
+
+    @property
+    def calibrated_by(self) -> str:
+        """The command that calibrates and imports calibrations."""
+        return TOOL
+
+    def devices(self) -> Mapping[str, str]:
+        """The port."""
+        return _resolved(self.port)
+
 
 @documented
 @attrs.frozen
-class LeaderOptions:
+class LeaderOptions(Options):
     """Options of `type: so101_leader`: an arm with STS3215 servos that is moved by hand."""
 
     port: str = option(
@@ -136,45 +151,45 @@ class LeaderOptions:
         """Joint of the leader -> joint of the robot."""
         return self.joints or {joint.removeprefix(self.prefix): joint for joint in robot.joint_names}
 
+    def terminal_keys(self, robot: Robot) -> Mapping[str, str]:
+        """The keys of the terminal that it reads."""
+        return {} if self.deadman == "none" else {self.deadman_key: "deadman"}
+
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+        """Check that the leader's joints map to joints of the robot, and that the self name joints of the leader."""
+        for ours, theirs in self.joints.items():
+            if theirs not in robot.joint_names:
+                yield OptionFault(
+                    ("joints", ours), f"unknown joint {theirs!r}{did_you_mean(theirs, robot.joint_names, 'known')}"
+                )
+        if strange := [joint for joint in robot.joint_names if not joint.startswith(self.prefix)]:
+            yield OptionFault(
+                ("prefix",),
+                f"joint {strange[0]!r} does not begin with {self.prefix!r}; give the device its arm in the mode, "
+                "e.g. teleop: {left: DEVICE}, where left is a joint group",
+            )
+        known = tuple(self.pairs(robot))
+        for key, names in (("inverted", self.inverted), ("scaled", self.scaled)):
+            if names != _GRIPPER:
+                yield from _unknown(key, names, known, "joint of the leader")
+
+    @property
+    def calibrated_by(self) -> str:
+        """The command that calibrates and imports calibrations."""
+        return TOOL
+
+    def devices(self) -> Mapping[str, str]:
+        """The port."""
+        return _resolved(self.port)
+
 
 @documented
 @attrs.frozen
-class EmulatedSignalOptions:
+class EmulatedSignalOptions(Options):
     """Options of `type: feetech_emulator`: a signal of the simulation that moves an emulated arm."""
 
     socket: str = option(help="socket that `ibrobot feetech emulate --physics` prints")
     signal: str = option(help="topic of the signal, e.g. /simulation/scene")
-
-
-def check_follower(options: FollowerOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
-    """Check that the joints in the options exist; they may belong to another component of the robot."""
-    for key, names in (("anchored", options.anchored), ("gentle", options.gentle)):
-        if names != _GRIPPER:
-            yield from _unknown(key, names, robot.joint_names, "joint")
-
-
-def leader_keys(options: LeaderOptions, robot: Robot) -> Mapping[str, str]:
-    """The keys of the terminal that it reads."""
-    return {} if options.deadman == "none" else {options.deadman_key: "deadman"}
-
-
-def check_leader(options: LeaderOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
-    """Check that the leader's joints map to joints of the robot, and that the options name joints of the leader."""
-    for ours, theirs in options.joints.items():
-        if theirs not in robot.joint_names:
-            yield OptionFault(
-                ("joints", ours), f"unknown joint {theirs!r}{did_you_mean(theirs, robot.joint_names, 'known')}"
-            )
-    if strange := [joint for joint in robot.joint_names if not joint.startswith(options.prefix)]:
-        yield OptionFault(
-            ("prefix",),
-            f"joint {strange[0]!r} does not begin with {options.prefix!r}; give the device its arm in the mode, "
-            "e.g. teleop: {left: DEVICE}, where left is a joint group",
-        )
-    known = tuple(options.pairs(robot))
-    for key, names in (("inverted", options.inverted), ("scaled", options.scaled)):
-        if names != _GRIPPER:
-            yield from _unknown(key, names, known, "joint of the leader")
 
 
 def _unknown(option: str, names: Sequence[str], known: Sequence[str], what: str) -> Iterator[OptionFault]:
@@ -184,11 +199,11 @@ def _unknown(option: str, names: Sequence[str], known: Sequence[str], what: str)
             yield OptionFault((option, i), f"unknown {what} {name!r}{did_you_mean(name, known, 'known')}")
 
 
-def serial_port(options: FollowerOptions | LeaderOptions) -> Mapping[str, str]:
+def _resolved(port: str) -> Mapping[str, str]:
     """The resolved path of the port."""
     from ibrobot_feetech.usb import find_port
 
     try:
-        return {"port": os.path.realpath(find_port(options.port))}
+        return {"port": os.path.realpath(find_port(port))}
     except HardwareError:  # it is not plugged in
-        return {"port": options.port}
+        return {"port": port}

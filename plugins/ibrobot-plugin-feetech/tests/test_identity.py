@@ -18,7 +18,7 @@ from ibrobot_feetech.emulator import Emulator
 from ibrobot_feetech.errors import PortError, PortForbidden, PortHeld
 from ibrobot_feetech.follower import FeetechFollower
 from ibrobot_feetech.leader import LeaderTeleop
-from ibrobot_feetech.options import FollowerOptions, LeaderOptions, serial_port
+from ibrobot_feetech.options import FollowerOptions, LeaderOptions
 from ibrobot_feetech.port import SerialPort
 from ibrobot_testing.command import command_line
 from ibrobot_testing.contexts import control_context, host_context
@@ -130,7 +130,7 @@ class TestRenumberedPorts:
         with Emulator(6) as emulator:
             prepare(emulator, arm_calibration())
             plug_in(monkeypatch, {"/dev/ttyACM0": "LEADER", emulator.port: "FOLLOWER"})
-            assert serial_port(named) == {"port": os.path.realpath(emulator.port)}
+            assert named.devices() == {"port": os.path.realpath(emulator.port)}
             arm = follower("serial:FOLLOWER", file)
             arm.connect()
             arm.disconnect()
@@ -144,7 +144,7 @@ class TestRenumberedPorts:
         plug_in(monkeypatch, {"/dev/ttyACM0": "LEADER", "/dev/ttyACM1": None})
         with pytest.raises(PortError, match=r"no USB adapter with this .* there is serial:LEADER at /dev/ttyACM0;"):
             follower("serial:FOLLOWER", file).connect()
-        assert serial_port(FollowerOptions("serial:FOLLOWER", str(file))) == {"port": "serial:FOLLOWER"}
+        assert FollowerOptions("serial:FOLLOWER", str(file)).devices() == {"port": "serial:FOLLOWER"}
         plug_in(monkeypatch, {})
         with pytest.raises(PortError, match=r"there is none with one"):
             SerialPort("serial:FOLLOWER", 1_000_000).open()

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from ibrobot_feetech.emulator import Emulator
 from ibrobot_feetech.leader import LeaderTeleop, read_pose
-from ibrobot_feetech.options import LeaderOptions, check_leader
+from ibrobot_feetech.options import LeaderOptions
 from ibrobot_testing import TeleopSuite
 from ibrobot_testing.contexts import START_NS, host_context, make_robot
 
@@ -553,9 +553,9 @@ class TestOneOfTwo:
 
     def test_a_prefix_that_does_not_fit_is_a_fault(self):
         options = LeaderOptions("/dev/null", "leader", prefix="right_")
-        assert list(check_leader(options, self.robot().part("right"), ())) == []
+        assert list(options.check(self.robot().part("right"), ())) == []
         for robot in (self.robot().part("left"), self.robot()):
-            (fault,) = check_leader(options, robot, ())
+            (fault,) = options.check(robot, ())
             assert fault.option == ("prefix",)
             assert fault.message == (
                 "joint 'left_shoulder_pan' does not begin with 'right_'; give the device its arm in the mode, e.g. "

@@ -3,20 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import Check, Late, TeleopDescriptor, hookimpl
 from ibrobot_core.app import Command
 from ibrobot_gamepad.options import GamepadOptions, SpaceMouseOptions
-
-if TYPE_CHECKING:
-    from ibrobot_core.api import OptionFault, Robot
-
-
-def _check(options: Any, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    from ibrobot_gamepad.mapping import check_mapping
-
-    return check_mapping(options, robot)
 
 
 @hookimpl
@@ -26,8 +16,6 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         type="gamepad",
         options=GamepadOptions,
         make=Late("ibrobot_gamepad.teleop:JogTeleop"),
-        check_options=_check,
-        events=Late("ibrobot_gamepad.mapping:events"),
         label="drive with a gamepad",
         summary="joint and tool jog with an Xbox, PlayStation, Switch, 8BitDo or other pad",
     )
@@ -35,8 +23,6 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         type="spacemouse",
         options=SpaceMouseOptions,
         make=Late("ibrobot_gamepad.teleop:JogTeleop"),
-        check_options=_check,
-        events=Late("ibrobot_gamepad.mapping:events"),
         label="drive with a SpaceMouse",
         summary="joint and tool jog with a SpaceMouse",
     )

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import attrs
 
-from ibrobot_core.api import did_you_mean, documented, option
+from ibrobot_core.api import Late, OptionFault, Options, did_you_mean, documented, option
 from ibrobot_gamepad.controls import MOUSE_AXES, MOUSE_BUTTONS, PAD_AXES, PAD_BUTTONS
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import OperatorEvent, Robot
 
 NONE = "none"
 """Value in a mapping of a function without control."""
@@ -102,9 +105,12 @@ def _poses(layout: Layout) -> Any:
     return _controls(layout.check_button, "pose -> button that drives there while held, or `none`")
 
 
+_CHECK, _EVENTS = Late("ibrobot_gamepad.mapping:check_mapping"), Late("ibrobot_gamepad.mapping:events")
+
+
 @documented
 @attrs.frozen
-class JogOptions:
+class JogOptions(Options):
     """Options that gamepads and SpaceMice share."""
 
     device: str = option("", help="VENDOR:PRODUCT or VENDOR:PRODUCT:SERIAL; empty: the first", validator=_check_device)
@@ -119,6 +125,15 @@ class JogOptions:
     long_press: float = option(0.5, unit="s", gt=0, le=5, help="how long the toggle button is held")
     cartesian: bool = option(True, help="whether the tool can be jogged; it needs robot.description.mjcf")
     gripper: str = option("gripper", help="group of joints that the gripper controls move")
+
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+        """Check that the controls fit the robot."""
+        yield from _CHECK(self, robot)
+
+    def events(self) -> Collection[OperatorEvent]:
+        """The events that have a button."""
+        events: Collection[OperatorEvent] = _EVENTS(self)
+        return events
 
 
 @documented

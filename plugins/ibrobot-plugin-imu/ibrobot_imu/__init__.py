@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from ibrobot_core.api import Check, Late, TeleopDescriptor, hookimpl
-from ibrobot_imu.options import ImuOptions, check_imu, imu_keys, serial_port
+from ibrobot_imu.options import ImuOptions
 
 
 @hookimpl
@@ -15,10 +15,6 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         type="imu",
         options=ImuOptions,
         make=Late("ibrobot_imu.teleop:ImuTeleop"),
-        check_options=check_imu,
-        devices=serial_port,
-        keys=imu_keys,
-        needs_terminal=lambda options: options.deadman == "key",
         label="drive by tilting a sensor",
         summary="moves the tool by the tilt of an orientation sensor (BNO08x, WitMotion)",
     )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import attrs
 
-from ibrobot_core.api import OptionFault, did_you_mean, documented, not_empty, option
+from ibrobot_core.api import OptionFault, Options, did_you_mean, documented, not_empty, option
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
@@ -32,7 +32,7 @@ def _check_tool(instance: Any, attribute: attrs.Attribute[Any], value: Mapping[s
 
 @documented
 @attrs.frozen
-class ImuOptions:
+class ImuOptions(Options):
     """Options of `type: imu`; the joints' own limits bound every speed."""
 
     port: str = option(
@@ -88,26 +88,23 @@ class ImuOptions:
         """The baud rate."""
         return self.baud_rate if self.baud_rate is not None else BAUD_RATES[self.model]
 
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+        """Check that the robot has one tool to move."""
+        groups = tuple(robot.groups)
+        if self.gripper != "gripper" and self.gripper not in groups:
+            message = f"unknown group {self.gripper!r}{did_you_mean(self.gripper, groups, 'known')}"
+            yield OptionFault(("gripper",), message)
+        if robot.description.mjcf is None:
+            yield OptionFault((), "tilting moves a tool, which needs robot.description.mjcf: set it", "mjcf")
+        arms = {robot.description.arm_of(name) for name in robot.joint_names}
+        if len(arms) > 1:
+            message = "the robot has several arms: give the device one in the mode, e.g. teleop: {left: DEVICE}"
+            yield OptionFault((), message)
 
-def imu_keys(options: ImuOptions, robot: Robot) -> Mapping[str, str]:
-    """The keys of the terminal that it reads."""
-    return {options.deadman_key: "deadman"} if options.deadman == "key" else {}
+    def devices(self) -> Mapping[str, str]:
+        """The resolved path of the port."""
+        return {"port": os.path.realpath(self.port)}
 
-
-def check_imu(options: ImuOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
-    """Check that the robot has one tool to move."""
-    groups = tuple(robot.groups)
-    if options.gripper != "gripper" and options.gripper not in groups:
-        message = f"unknown group {options.gripper!r}{did_you_mean(options.gripper, groups, 'known')}"
-        yield OptionFault(("gripper",), message)
-    if robot.description.mjcf is None:
-        yield OptionFault((), "tilting moves a tool, which needs robot.description.mjcf: set it", "mjcf")
-    arms = {robot.description.arm_of(name) for name in robot.joint_names}
-    if len(arms) > 1:
-        message = "the robot has several arms: give the device one in the mode, e.g. teleop: {left: DEVICE}"
-        yield OptionFault((), message)
-
-
-def serial_port(options: ImuOptions) -> Mapping[str, str]:
-    """The resolved path of the port."""
-    return {"port": os.path.realpath(options.port)}
+    def terminal_keys(self, robot: Robot) -> Mapping[str, str]:
+        """The keys of the terminal that it reads."""
+        return {self.deadman_key: "deadman"} if self.deadman == "key" else {}

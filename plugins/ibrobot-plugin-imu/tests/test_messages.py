@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from ibrobot_imu.messages import READERS, Angles
 
@@ -73,6 +73,8 @@ def test_a_damaged_byte_costs_a_message_and_gives_no_wrong_one(model, orientatio
 def test_lost_bytes_cost_at_most_two_messages(model, orientation, lost, length):
     one, reader = MESSAGES[model](*orientation), READERS[model]()
     stream = one[:lost] + one[lost + length :] + one * 4
+    # A checksum of 8 bits accepts one spliced message in 256: no reader can tell it from a whole one.
+    assume(stream[: reader.size] == one or not reader._is_valid(stream[: reader.size]))
     found = reader.feed(stream)
     assert 3 <= len(found) <= 5
     assert all(near(each, orientation, model) for each in found)

@@ -15,9 +15,6 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         type="keyboard",
         options=KeyboardOptions,
         make=Late("ibrobot_keyboard.teleop:KeyboardTeleop"),
-        check_options=lambda options, robot, joints: Late("ibrobot_keyboard.keymap:check_keys")(options, robot),
-        keys=Late("ibrobot_keyboard.keymap:keys_of"),
-        needs_terminal=lambda options: True,
         summary="joint and Cartesian jog from the terminal",
         label="drive by keys of the terminal",
     )

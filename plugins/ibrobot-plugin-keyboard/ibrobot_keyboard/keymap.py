@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from typing import Literal
 
 import attrs
 
-from ibrobot_core.api import OptionFault, Robot, TeleopError
-from ibrobot_keyboard.options import KeyboardOptions
+from ibrobot_core.api import TeleopError
 
 Mode = Literal["joints", "cartesian"]
 
@@ -110,44 +109,6 @@ def make_keymap(
     for group in (keymap.joints, keymap.cartesian):
         _check_single({**group, **keymap.common})
     return keymap
-
-
-def keymap_of(options: KeyboardOptions, robot: Robot) -> Keymap:
-    """The key bindings of a robot with these options.
-
-    Raises:
-        TeleopError: as `make_keymap`.
-    """
-    gripper = robot.groups.get(options.gripper, ())
-    return make_keymap(
-        [name for name in robot.joint_names if name not in gripper],
-        cartesian=options.cartesian,
-        gripper=bool(gripper),
-        home="home" in robot.description.poses,
-        overrides=options.keys,
-    )
-
-
-def keys_of(options: KeyboardOptions, robot: Robot) -> Mapping[str, str]:
-    """Key -> what it does; nothing for options with faults, which `check_keys` yields."""
-    try:
-        keymap = keymap_of(options, robot)
-    except TeleopError:
-        return {}
-    actions = {**keymap.cartesian, **keymap.joints, **keymap.common}
-    return {key: action for action, key in actions.items()}
-
-
-def check_keys(options: KeyboardOptions, robot: Robot) -> Iterator[OptionFault]:
-    """Check that joints have keys for both directions, each key has one action, and Cartesian jog has a model."""
-    if options.cartesian and robot.description.mjcf is None:
-        yield OptionFault(
-            ("cartesian",), "Cartesian jog needs robot.description.mjcf: set it, or cartesian: false", "mjcf"
-        )
-    try:
-        keymap_of(options, robot)
-    except TeleopError as error:
-        yield OptionFault(("keys",), str(error).removeprefix("keys: "))
 
 
 def _check_single(actions: Mapping[str, str]) -> None:

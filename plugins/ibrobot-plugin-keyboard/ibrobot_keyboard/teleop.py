@@ -19,7 +19,7 @@ from ibrobot_core.api import (
     ns,
     seconds,
 )
-from ibrobot_keyboard.keymap import CARTESIAN_AXES, Mode, keymap_of
+from ibrobot_keyboard.keymap import CARTESIAN_AXES, Mode
 from ibrobot_keyboard.options import KeyboardOptions
 
 _SPEED_STEP = 1.25
@@ -45,7 +45,7 @@ class KeyboardTeleop(Teleop):
         robot = ctx.robot
         self._arm = JogArm(robot, options.gripper)
         self._home = robot.pose("home") if "home" in robot.description.poses else None
-        self._keymap = keymap_of(options, robot)
+        self._keymap = options.keymap(robot)
         self._keys: queue.SimpleQueue[str] | None = None
         self._pressed = HeldKeys(options.hold)
         self._mode: Mode = "joints"

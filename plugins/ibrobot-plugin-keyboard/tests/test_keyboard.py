@@ -10,7 +10,6 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_keyboard import ibrobot_teleop
-from ibrobot_keyboard.keymap import check_keys
 from ibrobot_keyboard.options import KeyboardOptions
 from ibrobot_keyboard.teleop import KeyboardTeleop
 from ibrobot_terminal import KeyReader
@@ -269,7 +268,7 @@ def test_joints_after_the_seventh_have_no_default_keys(count):
     assert lines[0].endswith("i/k j6")
     keyless = ", ".join(f"j{i}" for i in range(7, count))
     assert lines[1] == f"no keys    {keyless}: set them under keys, e.g. j7+: '1', j7-: '2'"
-    assert list(check_keys(KeyboardOptions(cartesian=False), robot)) == []
+    assert list(KeyboardOptions(cartesian=False).check(robot, robot.joint_names)) == []
 
 
 def test_more_joints_than_keys_can_have_keys_of_their_own():

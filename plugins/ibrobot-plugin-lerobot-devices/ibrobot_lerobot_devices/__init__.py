@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from importlib.metadata import version
-from typing import Any
 
 from ibrobot_core.api import Check, HardwareDescriptor, Late, SensorDescriptor, TeleopDescriptor, hookimpl
 from ibrobot_core.app import Command
 from ibrobot_lerobot_devices.options import CameraOptions, CmdVelOptions, RobotOptions, TeleopOptions
-
-
-def _port(options: Any) -> Mapping[str, str]:
-    """The serial port of a device, if its config has one."""
-    port = options.config.get("port")
-    return {"port": os.path.realpath(port)} if isinstance(port, str) else {}
 
 
 @hookimpl
@@ -25,9 +17,6 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
         type="lerobot",
         options=RobotOptions,
         make=Late("ibrobot_lerobot_devices.hardware:LeRobotHardware"),
-        check_options=Late("ibrobot_lerobot_devices.registry:check_robot"),
-        devices=_port,
-        anchored=lambda options: options.anchored,
         torque_off="ibrobot lerobot torque-off",
         summary="a robot of LeRobot's, in a process of its own",
     )
@@ -40,10 +29,6 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         type="lerobot",
         options=TeleopOptions,
         make=Late("ibrobot_lerobot_devices.teleop:LeRobotTeleop"),
-        check_options=Late("ibrobot_lerobot_devices.registry:check_teleop"),
-        devices=_port,
-        keys=lambda options, robot: {} if options.deadman == "none" else {options.deadman_key: "deadman"},
-        needs_terminal=lambda options: options.deadman != "none",
         summary="a teleoperator of LeRobot's with joint positions, e.g. a leader arm",
         label="follow LeRobot's device",
     )
@@ -64,8 +49,6 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
         type="lerobot",
         options=CameraOptions,
         make=Late("ibrobot_lerobot_devices.camera:LeRobotCamera"),
-        check_options=Late("ibrobot_lerobot_devices.registry:check_camera"),
-        picture=lambda options: options.picture,
         summary="a camera of LeRobot's",
     )
 

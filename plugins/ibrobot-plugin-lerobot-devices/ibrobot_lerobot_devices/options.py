@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import os
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import attrs
 
-from ibrobot_core.api import documented, not_empty, option
+from ibrobot_core.api import OptionFault, Options, documented, not_empty, option
 from ibrobot_lerobot_devices.units import UNITS, Choices
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Robot
 
 GRIPPER = ("gripper",)
 """Default of `anchored`; ignored if another component has the gripper."""
@@ -47,9 +51,14 @@ _START = option(40.0, unit="s", gt=0, help="how long LeRobot may take to start a
 _LOST = option(3, ge=0, help="consecutive readings that LeRobot may fail to give")
 
 
+def _port(config: Mapping[str, Any]) -> Mapping[str, str]:
+    port = config.get("port")
+    return {"port": os.path.realpath(port)} if isinstance(port, str) else {}
+
+
 @documented
 @attrs.frozen
-class RobotOptions:
+class RobotOptions(Options):
     """Options of hardware `type: lerobot`: a robot of LeRobot's, in a process of its own."""
 
     robot: str = option(validator=not_empty, help="LeRobot's type of the robot, e.g. koch_follower")
@@ -75,10 +84,20 @@ class RobotOptions:
         """What the options say about the conversion of units."""
         return Choices(self.names, self.units, self.zero_at, self.anchored, self.inverted)
 
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+        """Check them against LeRobot and the robot."""
+        from ibrobot_lerobot_devices.registry import check_robot
+
+        return check_robot(self, robot)
+
+    def devices(self) -> Mapping[str, str]:
+        """The serial port, if the config has one."""
+        return _port(self.config)
+
 
 @documented
 @attrs.frozen
-class TeleopOptions:
+class TeleopOptions(Options):
     """Options of teleop `type: lerobot`: a teleoperator of LeRobot's with joint positions, e.g. a leader arm."""
 
     teleop: str = option(validator=not_empty, help="LeRobot's type of the teleoperator, e.g. koch_leader")
@@ -116,10 +135,24 @@ class TeleopOptions:
         """What the options say about the conversion of units."""
         return Choices(self.names, self.units, self.zero_at, (), self.inverted, self.scaled)
 
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+        """Check them against LeRobot and the robot."""
+        from ibrobot_lerobot_devices.registry import check_teleop
+
+        return check_teleop(self, robot)
+
+    def devices(self) -> Mapping[str, str]:
+        """The serial port, if the config has one."""
+        return _port(self.config)
+
+    def terminal_keys(self, robot: Robot) -> Mapping[str, str]:
+        """The deadman."""
+        return {} if self.deadman == "none" else {self.deadman_key: "deadman"}
+
 
 @documented
 @attrs.frozen
-class CmdVelOptions:
+class CmdVelOptions(Options):
     """Options of teleop `type: cmd_vel`: a topic of twists that drives a base, whose axes are joints of the robot."""
 
     topic: str = option("/cmd_vel", validator=_is_topic, help="topic of geometry_msgs/msg/Twist or TwistStamped")
@@ -131,7 +164,7 @@ class CmdVelOptions:
 
 @documented
 @attrs.frozen
-class CameraOptions:
+class CameraOptions(Options):
     """Options of a peripheral `type: lerobot` of kind camera: a camera of LeRobot's."""
 
     camera: str = option(validator=not_empty, help="LeRobot's type of the camera, e.g. zmq")
@@ -148,3 +181,9 @@ class CameraOptions:
         """Height and width of the pictures [px], if the config has them."""
         height, width = self.config.get("height"), self.config.get("width")
         return (height, width) if isinstance(height, int) and isinstance(width, int) else None
+
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+        """Check them against LeRobot."""
+        from ibrobot_lerobot_devices.registry import check_device
+
+        return check_device("camera", "camera", self.camera, self.config)

@@ -19,7 +19,7 @@ from ibrobot_lerobot_devices.options import GRIPPER
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
-    from ibrobot_lerobot_devices.options import CameraOptions, RobotOptions, TeleopOptions
+    from ibrobot_lerobot_devices.options import RobotOptions, TeleopOptions
 
 _PREFIXES = ("lerobot_robot_", "lerobot_teleoperator_", "lerobot_camera_")
 """LeRobot imports the distributions whose names begin with one of these."""
@@ -146,21 +146,16 @@ def _fits(word: str, value: object) -> bool:
     return isinstance(value, _PYTHON.get(word, (object,)))
 
 
-def check_robot(options: RobotOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+def check_robot(options: RobotOptions, robot: Robot) -> Iterator[OptionFault]:
     """Check the options of a robot."""
     yield from check_device("robot", "robot", options.robot, options.config)
     yield from check_joints(options, robot)
 
 
-def check_teleop(options: TeleopOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+def check_teleop(options: TeleopOptions, robot: Robot) -> Iterator[OptionFault]:
     """Check the options of a teleoperator."""
     yield from check_device("teleoperator", "teleop", options.teleop, options.config)
     yield from check_joints(options, robot)
-
-
-def check_camera(options: CameraOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
-    """Check the options of a camera."""
-    return check_device("camera", "camera", options.camera, options.config)
 
 
 def check_joints(options: RobotOptions | TeleopOptions, robot: Robot) -> Iterator[OptionFault]:

@@ -61,9 +61,8 @@ def test_functions_of_the_descriptors(hook: str, options: Any) -> None:
     ],
 )
 def test_wrong_options_are_named(changes: dict[str, Any], option: tuple[Any, ...], message: str) -> None:
-    (descriptor,) = ibrobot_lerobot_devices.ibrobot_hardware()
     options = RobotOptions(**{"robot": "fake_arm", "config": {"port": "x"}, **changes})
-    (fault,) = descriptor.check_options(options, make_robot(), ())
+    (fault,) = options.check(make_robot(), ())
     assert fault.option == option
     assert message in fault.message
 
@@ -71,8 +70,7 @@ def test_wrong_options_are_named(changes: dict[str, Any], option: tuple[Any, ...
 def test_without_lerobot_nothing_is_checked_and_doctor_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link, "is_installed", lambda: False)
     monkeypatch.setattr(registry, "is_installed", lambda: False)
-    (descriptor,) = ibrobot_lerobot_devices.ibrobot_hardware()
-    assert list(descriptor.check_options(RobotOptions("any"), make_robot(), ())) == []
+    assert list(RobotOptions("any").check(make_robot(), ())) == []
     (check,) = ibrobot_lerobot_devices.ibrobot_doctor()
     assert not check.ok
     assert check.remedy == "pip install lerobot"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import attrs
 
-from ibrobot_core.api import documented, option
+from ibrobot_core.api import Options, documented, option
 
 CODECS = ("libsvtav1", "h264", "hevc", "h264_nvenc", "hevc_nvenc", "h264_videotoolbox", "hevc_videotoolbox")
 """Encoders by LeRobot's names; those from `h264_nvenc` on need a GPU."""
@@ -14,7 +14,7 @@ CODECS = ("libsvtav1", "h264", "hevc", "h264_nvenc", "hevc_nvenc", "h264_videoto
 
 @documented
 @attrs.frozen
-class LeRobotOptions:
+class LeRobotOptions(Options):
     """Image storage and file sizes."""
 
     videos: bool = option(True, help="store images as videos; false: as lossless PNG in the tables")
@@ -31,7 +31,7 @@ class LeRobotOptions:
 
 @documented
 @attrs.frozen
-class LeRobotPolicyOptions:
+class LeRobotPolicyOptions(Options):
     """Checkpoint, device and precision."""
 
     path: Path = option(help="folder of the checkpoint: config.json, processors and, for inference, model.safetensors")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import attrs
 
-from ibrobot_core.api import documented, option
+from ibrobot_core.api import Options, documented, option
 
 MIB = 1 << 20
 COMPRESSIONS = ("none", "lz4", "zstd")
@@ -12,7 +12,7 @@ COMPRESSIONS = ("none", "lz4", "zstd")
 
 @documented
 @attrs.frozen
-class McapOptions:
+class McapOptions(Options):
     """Options of writing episodes."""
 
     compression: str = option("none", choices=COMPRESSIONS, help="compression of chunks; useless for JPEG images")

@@ -3,20 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
-from ibrobot_core.api import Late, OptionFault, hookimpl
+from ibrobot_core.api import Late, hookimpl
 from ibrobot_core.app import Command, SectionDescriptor
 from ibrobot_mcp.options import McpOptions
-
-if TYPE_CHECKING:
-    from ibrobot_core.api import Robot
-
-
-def _check(options: McpOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    for name, path in (("certificate", options.certificate), ("key", options.key)):
-        if path is not None and not path.is_file():
-            yield OptionFault((name,), f"{path}: no such file")
 
 
 @hookimpl
@@ -26,7 +16,6 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
         type="mcp",
         options=McpOptions,
         make=Late("ibrobot_mcp.door:AgentDoor"),
-        check_options=_check,
         summary="the robot's services as tools of the Model Context Protocol, within what a person grants",
     )
 

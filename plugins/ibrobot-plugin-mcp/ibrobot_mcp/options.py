@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import attrs
 from ibrobot_http.addresses import check_name, is_loopback
 
-from ibrobot_core.api import documented, option
+from ibrobot_core.api import OptionFault, Options, documented, option
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Robot
 
 LEAST_TOKEN = 16
 
 
 @documented
 @attrs.frozen
-class McpOptions:
+class McpOptions(Options):
     """Options of the section `mcp`."""
 
     http: bool = option(True, help="whether agents connect by HTTP; `ibrobot mcp` needs none")
@@ -39,3 +44,9 @@ class McpOptions:
             )
         if self.token is not None and len(self.token) < LEAST_TOKEN:
             raise ValueError(f"token must have at least {LEAST_TOKEN} characters")
+
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+        """Check that the files of the certificate exist."""
+        for name, path in (("certificate", self.certificate), ("key", self.key)):
+            if path is not None and not path.is_file():
+                yield OptionFault((name,), f"{path}: no such file")

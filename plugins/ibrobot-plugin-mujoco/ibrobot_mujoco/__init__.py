@@ -16,10 +16,9 @@ from ibrobot_core.api import (
     hookimpl,
 )
 from ibrobot_core.app import Command, Kind
-from ibrobot_mujoco.check import check_world
 from ibrobot_mujoco.experts import EXPERTS
 from ibrobot_mujoco.gl import choose, from_module
-from ibrobot_mujoco.options import CameraOptions, MujocoOptions, picture_size
+from ibrobot_mujoco.options import CameraOptions, MujocoOptions
 from ibrobot_mujoco.scene import SceneDescriptor
 from ibrobot_mujoco.scenes import SCENES
 
@@ -38,8 +37,6 @@ def ibrobot_hardware() -> Iterable[HardwareDescriptor]:
         default=True,
         simulated=True,
         sensors={"camera": "mujoco"},
-        check_options=check_world,
-        scene=from_module("scene_objects", "scene_objects"),
         film={"type": "mujoco", "camera": "front", "width": 320, "height": 240, "fps": 10},
         summary="the robot's MJCF in MuJoCo, with the objects of a scene",
     )
@@ -66,7 +63,6 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
         options=CameraOptions,
         make=from_module("camera", "MujocoCamera"),
         check=_can_render,
-        picture=picture_size,
         summary="a camera in the simulated scene",
     )
 

@@ -28,7 +28,7 @@ def _unusable(options: MujocoOptions, robot: Robot) -> Iterator[OptionFault]:
         yield OptionFault((), " ".join(str(error).split()))
 
 
-def check_world(options: MujocoOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+def check_world(options: MujocoOptions, robot: Robot) -> Iterator[OptionFault]:
     """Check that the robot has an MJCF, and that the pose and joints in the options exist."""
     poses = list(robot.description.poses)
     if robot.description.mjcf is None:

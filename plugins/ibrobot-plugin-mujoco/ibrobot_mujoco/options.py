@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Literal
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Literal
 
 import attrs
 
-from ibrobot_core.api import documented, option
+from ibrobot_core.api import Late, OptionFault, Options, documented, option
+from ibrobot_mujoco.gl import from_module
 from ibrobot_mujoco.scene import SceneConfig
 from ibrobot_mujoco.scenes import scene
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Robot, SceneObject
 
 Vec3 = tuple[float, float, float]
 
@@ -75,7 +79,7 @@ class SceneThing:
 
 @documented
 @attrs.frozen
-class MujocoOptions:
+class MujocoOptions(Options):
     """Options of the simulation. Servo values of None use those of the MJCF."""
 
     scene: SceneConfig = option(factory=scene, help="type of scene, or a mapping with type and its options")
@@ -97,10 +101,19 @@ class MujocoOptions:
     objects: Mapping[str, SceneThing] = option(factory=dict, help="further objects, e.g. obstacles, by name")
     cameras: tuple[SceneCamera, ...] = option((), help="cameras in addition to `top`, `front` and those of the MJCF")
 
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+        """Check them against the robot and its MJCF."""
+        yield from Late("ibrobot_mujoco.check:check_world")(self, robot)
+
+    def scene_objects(self, robot: Robot) -> Sequence[SceneObject]:
+        """The objects around the robot."""
+        objects: Sequence[SceneObject] = from_module("scene_objects", "scene_objects")(self, robot)
+        return objects
+
 
 @documented
 @attrs.frozen
-class CameraOptions:
+class CameraOptions(Options):
     """Options of a simulated camera."""
 
     camera: str | None = option(
@@ -116,7 +129,7 @@ class CameraOptions:
     jpeg_quality: int = option(90, ge=1, le=100, help="JPEG quality")
     shadows: bool = option(False, help="whether to render shadows (three times the cost)")
 
-
-def picture_size(options: CameraOptions) -> tuple[int, int]:
-    """Height and width of the images [px]."""
-    return options.height, options.width
+    @property
+    def picture(self) -> tuple[int, int]:
+        """Height and width of the images [px]."""
+        return self.height, self.width

@@ -68,7 +68,7 @@ class SceneDescriptor(Descriptor[Scene[Any, Any]]):
     make: Callable[[Any, Robot], Scene[Any, Any]] = attrs.field(kw_only=True)  # type: ignore[assignment]
     """Options and robot -> the scene."""
 
-    def kept(self, options: Any) -> Mapping[str, Any]:
+    def kept(self) -> Mapping[str, Any]:
         """Itself, with which the simulation makes the scene."""
         return {"descriptor": self}
 

@@ -6,7 +6,7 @@ import threading
 import warnings
 from typing import Any, override
 
-from ibrobot_core.api import Context, IbrobotError, NoOptions, Viewer
+from ibrobot_core.api import Context, IbrobotError, Options, Viewer
 from ibrobot_core.app import Subscription
 from ibrobot_mujoco.options import MujocoOptions
 from ibrobot_mujoco.state import PHYSICS_TOPIC, DrawnWorld, newest
@@ -18,7 +18,7 @@ _CLOSING_S = 5.0
 class MujocoViewer(Viewer):
     """Shows the physics state on the bus. Actions in the window do not affect the simulation."""
 
-    def __init__(self, options: NoOptions, ctx: Context) -> None:
+    def __init__(self, options: Options, ctx: Context) -> None:
         self._ctx = ctx
         self._window: Any = None
         self._states: Subscription | None = None

@@ -6,7 +6,6 @@ from typing import override
 
 import numpy as np
 import pytest
-from ibrobot_mujoco import ibrobot_hardware
 from ibrobot_mujoco.hardware import MujocoHardware
 from ibrobot_mujoco.options import MujocoOptions
 from ibrobot_mujoco.scene_objects import scene_objects
@@ -46,8 +45,7 @@ class TestConformanceWithObjects(SimulatedHardwareSuite):
 
 
 def test_planners_get_every_object_of_the_scene():
-    (descriptor,) = ibrobot_hardware()
-    found = {thing.name: thing for thing in descriptor.scene(options(), ROBOT)}
+    found = {thing.name: thing for thing in options().scene_objects(ROBOT)}
     parts = {"bin_floor", "bin_left", "bin_right", "bin_front", "bin_back"}
     assert set(found) == {"table", "cube", *parts, "post", "can", "ball"}
     assert (found["table"].shape, found["table"].size) == ("plane", ())

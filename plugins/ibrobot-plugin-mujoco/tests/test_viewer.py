@@ -20,7 +20,7 @@ from ibrobot_testing import ViewerSuite, host_context
 from ibrobot_testing.suite import Suite
 from mujoco import viewer as mujoco_viewer
 
-from ibrobot_core.api import Context, Float64MultiArray, IbrobotError, Message, NoOptions, Viewer
+from ibrobot_core.api import Context, Float64MultiArray, IbrobotError, Message, Options, Viewer
 
 ROBOT = so101()
 OPTIONS = MujocoOptions()
@@ -64,7 +64,7 @@ class _Subject(Suite[Viewer]):
 
     @override
     def make(self, ctx: Context) -> MujocoViewer:
-        return MujocoViewer(NoOptions(), ctx)
+        return MujocoViewer(Options(), ctx)
 
 
 class TestConformance(_Subject, ViewerSuite):
@@ -99,7 +99,7 @@ def test_no_display_is_an_error_that_says_so(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_needs_a_simulation() -> None:
-    viewer = MujocoViewer(NoOptions(), host_context("window", robot=ROBOT))
+    viewer = MujocoViewer(Options(), host_context("window", robot=ROBOT))
     with pytest.raises(IbrobotError, match=r"viewer type mujoco needs a running simulation: \{type: mujoco\}"):
         viewer.open()
 
@@ -108,7 +108,7 @@ def test_needs_a_simulation() -> None:
 def test_a_real_window_opens_follows_and_closes() -> None:
     ctx = _Subject().context()
     assert ctx.bus is not None
-    viewer = MujocoViewer(NoOptions(), ctx)
+    viewer = MujocoViewer(Options(), ctx)
     for _ in range(2):
         viewer.open()
         try:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import attrs
 
-from ibrobot_core.api import Late, SensorDescriptor, documented, hookimpl, not_empty, option
+from ibrobot_core.api import Late, Options, SensorDescriptor, documented, hookimpl, not_empty, option
 from ibrobot_core.app import Command
 
 
 @documented
 @attrs.frozen
-class NetFtOptions:
+class NetFtOptions(Options):
     """Options of `type: netft`: a force-torque sensor that streams over Ethernet."""
 
     host: str = option(validator=not_empty, help="address of the sensor, e.g. 192.168.1.1")
@@ -26,6 +26,10 @@ class NetFtOptions:
     frame: str = option("", help="frame of the measured wrench; NAME_frame if empty")
     silence: float = option(1.0, unit="s", gt=0, help="time without a record after which the sensor counts as gone")
 
+    def devices(self) -> Mapping[str, str]:
+        """The sensor."""
+        return {"host": f"{self.host}:{self.port}"}
+
 
 @hookimpl
 def ibrobot_sensors() -> Iterable[SensorDescriptor]:
@@ -38,7 +42,6 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
         summary="force-torque sensor with ATI's Net F/T protocol",
         topic="/force/{name}/wrench",
         message="geometry_msgs/msg/WrenchStamped",
-        devices=lambda options: {"host": f"{options.host}:{options.port}"},
     )
 
 

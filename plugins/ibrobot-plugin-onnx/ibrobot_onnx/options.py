@@ -6,7 +6,7 @@ from pathlib import Path
 
 import attrs
 
-from ibrobot_core.api import documented, option
+from ibrobot_core.api import Options, documented, option
 
 MANIFEST = "onnx_policy.json"
 """The file that describes the graphs of an exported policy."""
@@ -22,7 +22,7 @@ PROVIDERS = {
 
 @documented
 @attrs.frozen
-class OnnxPolicyOptions:
+class OnnxPolicyOptions(Options):
     """Folder, execution provider and threads."""
 
     path: Path = option(help=f"folder of `ibrobot export`: {MANIFEST} and, for inference, its graphs")

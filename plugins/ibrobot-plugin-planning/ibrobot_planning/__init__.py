@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from ibrobot_core.api import ExecutorDescriptor, Late, OptionFault, did_you_mean, hookimpl
+from ibrobot_core.api import ExecutorDescriptor, Late, hookimpl
 from ibrobot_core.app import Command, Kind, SectionDescriptor, SourceDescriptor
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
 from ibrobot_planning.guard.descriptor import GuardDescriptor
@@ -16,7 +16,6 @@ from ibrobot_planning.world.engines import find_engines
 from ibrobot_planning.world.options import WorldOptions
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import Robot
     from ibrobot_core.app import Component, RobotConfig, RunView
 
 
@@ -42,14 +41,8 @@ def ibrobot_planners() -> Iterable[PlannerDescriptor]:
         options=RrtConnectOptions,
         make=Late("ibrobot_planning.planners.rrt:RrtConnectPlanner"),
         check=find_engines,
-        check_options=_needs_model,
         summary="around obstacles, to joint positions or poses of the tool, checked against padding after timing",
     )
-
-
-def _needs_model(options: RrtConnectOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    if robot.description.mjcf is None:
-        yield OptionFault((), "planning around obstacles needs robot.description.mjcf: set it", "mjcf")
 
 
 @hookimpl
@@ -60,7 +53,6 @@ def ibrobot_guards() -> Iterable[GuardDescriptor]:
         options=ClearanceGuardOptions,
         make=Late("ibrobot_planning.guard.clearance_guard:ClearanceGuard"),
         check=find_engines,
-        check_options=_check_guard,
         summary="keeps commands of every origin clear of the arm itself and of the world",
     )
 
@@ -68,11 +60,6 @@ def ibrobot_guards() -> Iterable[GuardDescriptor]:
 def _feeds_guard(config: RobotConfig) -> bool:
     guard = config.control.guard
     return guard is not None and guard.type == "clearance" and "world" in config.plugin_sections
-
-
-def _check_guard(options: ClearanceGuardOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    if robot.description.mjcf is None:
-        yield OptionFault((), "the guard needs robot.description.mjcf: set it, or leave control.guard out", "mjcf")
 
 
 @hookimpl
@@ -115,55 +102,6 @@ def _world(options: WorldOptions, session: RunView) -> Component:
     return WorldKeeper(options, session)
 
 
-def _unknown_names(options: WorldOptions, robot: Robot) -> Iterable[OptionFault]:
-    """Faults of names that are neither a link of the robot's model nor an object."""
-    from ibrobot_kinematics.errors import KinematicsError
-    from ibrobot_kinematics.mjcf_names import read_names
-
-    from ibrobot_planning.world.objects import FLOOR
-
-    mjcf = robot.description.mjcf
-    if mjcf is None:
-        return
-    try:
-        model = read_names(mjcf)
-    except KinematicsError:
-        return  # its own check reports it
-    prefixes = tuple(robot.description.arms) or ("",)
-    links = [prefix + name for prefix in prefixes for name in ("world", *model.bodies, *model.sites)]
-    known = [*links, *options.objects, *options.clouds, FLOOR]
-    for name, thing in options.objects.items():
-        if name in links:
-            yield OptionFault(("objects", name), f"a link of {mjcf.name} has this name already")
-        if thing.link is not None and thing.link not in links:
-            yield OptionFault(
-                ("objects", name, "link"), f"unknown link {thing.link!r}{did_you_mean(thing.link, links, 'known')}"
-            )
-        for i, other in enumerate(thing.may_touch):
-            if other not in known and not options.scene:  # objects of the scene are checked at the start
-                message = f"unknown link or object {other!r}{did_you_mean(other, known, 'known')}"
-                yield OptionFault(("objects", name, "may_touch", i), message)
-
-
-def _check_world(options: WorldOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    """Check that the objects have sensible sizes and that meshes can be read."""
-    for name, thing in options.objects.items():
-        try:
-            thing.made()
-        except ValueError as error:
-            yield OptionFault(("objects", name), str(error))
-    yield from _unknown_names(options, robot)
-    for name, cloud in options.clouds.items():
-        if name in options.objects:
-            yield OptionFault(("clouds", name), f"there is an object {name!r} already; clouds need names of their own")
-        if cloud.max_age <= 1 / cloud.rate:
-            yield OptionFault(
-                ("clouds", name, "max_age"),
-                f"{cloud.max_age:g} s is too small for rate {cloud.rate:g} Hz: the cells would be too old before the"
-                f" next update; set it above {1 / cloud.rate:g} s, or rate above {1 / cloud.max_age:g} Hz",
-            )
-
-
 @hookimpl
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
     """The sections `world`, `goals` and `tasks`, and what tells the guard of the world."""
@@ -172,7 +110,6 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
         options=WorldOptions,
         make=_world,
         check=find_engines,
-        check_options=_check_world,
         summary="what planners avoid: boxes, spheres, cylinders, meshes, planes, point clouds; services change it",
     )
     yield SectionDescriptor(

@@ -29,6 +29,7 @@ from ibrobot_core.api import (
     Header,
     JointTrajectory,
     JointTrajectoryPoint,
+    Options,
     PlanningError,
     Pose,
     Vector,
@@ -44,7 +45,7 @@ DT = 0.02
 
 @documented
 @attrs.frozen
-class BatchOptions:
+class BatchOptions(Options):
     """Options of both planners."""
 
     batch: int = option(8, ge=1, help="goals planned at once")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import override
 
 from ibrobot_planning.planner import PlannerDescriptor
 from ibrobot_planning.suite import FakePlanner
@@ -18,9 +19,11 @@ from ibrobot_testing.fakes import (
 from ibrobot_core.api import (
     ExecutorDescriptor,
     HardwareDescriptor,
+    Options,
     PolicyDescriptor,
     Pose,
     RecorderDescriptor,
+    Robot,
     SceneObject,
     SensorDescriptor,
     Vector3,
@@ -37,11 +40,15 @@ SCENE = (
 )
 
 
+class SceneOptions(Options):
+    @override
+    def scene_objects(self, robot: Robot) -> Sequence[SceneObject]:
+        return SCENE
+
+
 @hookimpl
 def ibrobot_hardware() -> Iterator[HardwareDescriptor]:
-    yield HardwareDescriptor(
-        "scene", lambda options, ctx: FakeHardware(ctx), "a scene", simulated=True, scene=lambda options, robot: SCENE
-    )
+    yield HardwareDescriptor("scene", lambda options, ctx: FakeHardware(ctx), "a scene", SceneOptions, simulated=True)
     yield HardwareDescriptor("arm", lambda options, ctx: FakeRealHardware(ctx), "an arm")
 
 

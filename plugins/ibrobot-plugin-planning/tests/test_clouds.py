@@ -10,7 +10,6 @@ from typing import Any, override
 import attrs
 import numpy as np
 import pytest
-from ibrobot_planning import ibrobot_sections
 from ibrobot_planning.world.clouds import CLEAR, SensedWorld
 from ibrobot_planning.world.objects import OBSERVED, Plane, Voxels
 from ibrobot_planning.world.options import WorldOptions
@@ -294,9 +293,8 @@ def test_mistakes_in_the_yaml(text: str, told: str):
 
 
 def test_cloud_with_the_name_of_an_object_is_refused(tmp_path: Path):
-    descriptor = next(each for each in ibrobot_sections() if each.type == "world")
     both = options("objects: {a: {shape: plane}}\nclouds: {a: {topic: /p}}")
-    (fault,) = descriptor.check_options(both, make_robot(tmp_path), ())
+    (fault,) = both.check(make_robot(tmp_path), ())
     assert (fault.option, fault.message) == (
         ("clouds", "a"),
         "there is an object 'a' already; clouds need names of their own",

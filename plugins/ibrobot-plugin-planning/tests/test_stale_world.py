@@ -525,9 +525,8 @@ def test_mistakes_in_the_rules(text: str, told: str):
 
 
 def test_limit_below_the_interval_of_updates_is_refused(tmp_path: Path):
-    section = next(each for each in ibrobot_sections() if each.type == "world")
     options = single_options(WorldOptions, (), "world", text="clouds: {a: {topic: /p, rate: 0.5}}")
-    (fault,) = section.check_options(options, make_robot(tmp_path), ())
+    (fault,) = options.check(make_robot(tmp_path), ())
     assert fault.option == ("clouds", "a", "max_age")
     assert "1.5 s is too small for rate 0.5 Hz" in fault.message
     assert "set it above 2 s" in fault.message

@@ -43,7 +43,7 @@ def loaded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[RobotConf
 def check(loaded: tuple[RobotConfig, Registry]) -> Check:
     """Checks the text of a task for the arm, in mode `plan` unless another is given."""
     config, registry = loaded
-    world = first_world(config.plugin_sections["world"].options, scene_objects(config, registry))
+    world = first_world(config.plugin_sections["world"].options, scene_objects(config))
 
     def checked(text: str, mode: str = "plan", parameters: tuple[str, ...] = (), **changes: Any) -> CheckedTask:
         given = {"world": world, "movable": ("cube", "ball"), **changes}

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from ibrobot_kinematics.clearance import CLEARANCE
 from ibrobot_kinematics.poses import matrix
-from ibrobot_planning import ibrobot_sections
 from ibrobot_planning.planner import JointGoal, PlanRequest
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.rrt import RrtConnectPlanner
@@ -180,18 +179,17 @@ def test_malformed_worlds_are_refused(text, message):
 
 
 def test_meshes_and_sizes_are_checked_before_a_run(tmp_path):
-    descriptor = next(each for each in ibrobot_sections() if each.type == "world")
     path = tmp_path / "part.stl"
     path.write_text(STL)
     good = options(f"objects: {{part: {{shape: mesh, file: {path}, scale: 0.001}}}}")
-    assert list(descriptor.check_options(good, make_robot(tmp_path), ())) == []
+    assert list(good.check(make_robot(tmp_path), ())) == []
     assert isinstance(good.objects["part"].made().shape, Mesh)
     for text, message in (
         ("{part: {shape: mesh, file: none.stl}}", "no file .*none.stl"),
         ("{part: {shape: box, size: [600, 800, 20]}}", "at most 100 m"),
         (f"{{part: {{shape: mesh, file: {path}, convex: true}}}}", "a flat mesh has no convex hull"),
     ):
-        (fault,) = descriptor.check_options(options(f"objects: {text}"), make_robot(tmp_path), ())
+        (fault,) = options(f"objects: {text}").check(make_robot(tmp_path), ())
         assert fault.option == ("objects", "part")
         with pytest.raises(ValueError, match=message):
             raise ValueError(fault.message)

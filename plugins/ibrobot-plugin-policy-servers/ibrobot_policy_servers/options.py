@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 import attrs
 
-from ibrobot_core.api import documented, option
+from ibrobot_core.api import Options, documented, option
 
 
 def _websocket(instance: Any, attribute: attrs.Attribute[Any], value: str) -> None:
@@ -68,7 +68,7 @@ class ActionMap:
 
 @documented
 @attrs.frozen
-class ServerOptions:
+class ServerOptions(Options):
     """The mapping to a server, and how long to wait for it."""
 
     observations: tuple[ObservationMap, ...] = option(validator=_not_empty, help="what the server gets")

@@ -16,7 +16,6 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
         type="ros",
         options=RosOptions,
         make=Late("ibrobot_ros.section:RosNode"),
-        offers=RosOptions.offers,
         summary="a ROS 2 node beside the run: topics, services and actions",
     )
 

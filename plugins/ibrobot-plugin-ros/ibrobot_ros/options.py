@@ -9,7 +9,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import MESSAGE_TYPES, did_you_mean, documented, option
+from ibrobot_core.api import MESSAGE_TYPES, Options, did_you_mean, documented, option
 
 NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 """A full name of ROS."""
@@ -62,7 +62,7 @@ def _check_qos(instance: object, attribute: attrs.Attribute[Any], value: Mapping
 
 @documented
 @attrs.frozen
-class RosInstallation:
+class RosInstallation(Options):
     """The ROS to use, and the part of its network to reach."""
 
     python: str | None = option(

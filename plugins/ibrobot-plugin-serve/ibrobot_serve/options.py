@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import attrs
 
-from ibrobot_core.api import documented, option
+from ibrobot_core.api import Options, documented, option
 
 _NEW_WEIGHTS = "continue, with a warning, if the {} restarts with other weights; otherwise the arm holds"
 
 
 @documented
 @attrs.frozen
-class ProcessOptions:
+class ProcessOptions(Options):
     """Options of `execution_mode: process`."""
 
     hang_timeout: float = option(
@@ -22,7 +22,7 @@ class ProcessOptions:
 
 @documented
 @attrs.frozen
-class DistributedOptions:
+class DistributedOptions(Options):
     """Options of `execution_mode: distributed`."""
 
     server_model: str = option("", help="name of the model on the server, if different")

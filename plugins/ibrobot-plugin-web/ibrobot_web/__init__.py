@@ -3,20 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
-from ibrobot_core.api import Late, OptionFault, TeleopDescriptor, ViewerDescriptor, hookimpl
+from ibrobot_core.api import Late, TeleopDescriptor, ViewerDescriptor, hookimpl
 from ibrobot_core.app import Command
 from ibrobot_web.options import WebOptions, WebTeleopOptions
-
-if TYPE_CHECKING:
-    from ibrobot_core.api import Robot
-
-
-def _check_viewer(options: WebOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    for name, path in (("certificate", options.certificate), ("key", options.key)):
-        if path is not None and not path.is_file():
-            yield OptionFault((name,), f"{path}: no such file")
 
 
 @hookimpl
@@ -26,7 +16,6 @@ def ibrobot_viewers() -> Iterable[ViewerDescriptor]:
         type="web",
         options=WebOptions,
         make=Late("ibrobot_web.viewer:WebViewer"),
-        check_options=_check_viewer,
         flag="--web",
         begins_episodes=True,
         summary="a page in the browser, which shows and drives the robot",

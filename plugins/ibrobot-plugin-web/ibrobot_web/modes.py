@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from ibrobot_core.api import IbrobotError, TeleopDescriptor
+from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import ControlMode, Plugins, RobotConfig
 
 _PAGE = "web"
@@ -32,8 +32,7 @@ def modes_json(config: RobotConfig, registry: Plugins, *, terminal: bool) -> lis
             "planner": mode.planner is not None,
             "policy": mode.inference is not None,
             "jogs": _jogs(config, mode),
-            "unavailable": config.unavailable.get(name)
-            or ("" if terminal else _lacks_terminal(config, registry, mode)),
+            "unavailable": config.unavailable.get(name) or ("" if terminal else _lacks_terminal(config, mode)),
         }
         for name, mode in config.control_modes.items()
     ]
@@ -78,15 +77,6 @@ def _words(registry: Plugins, kind: str, type_: str) -> str:
     return words
 
 
-def _lacks_terminal(config: RobotConfig, registry: Plugins, mode: ControlMode) -> str:
-    names = [name for name in mode.devices.values() if _needs_terminal(registry, config.teleoperation[name])]
+def _lacks_terminal(config: RobotConfig, mode: ControlMode) -> str:
+    names = [name for name in mode.devices.values() if config.teleoperation[name].options.terminal_keys(config.robot)]
     return f"{' and '.join(names)} needs a terminal: start the robot in one, with ibrobot launch" if names else ""
-
-
-def _needs_terminal(registry: Plugins, device: Any) -> bool:
-    try:
-        descriptor = registry.find("teleop", device.type)
-    except IbrobotError:
-        return False  # the mode is unavailable
-    assert isinstance(descriptor, TeleopDescriptor)
-    return descriptor.needs_terminal(device.options)

@@ -6,8 +6,8 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ibrobot_core.api import Float64MultiArray, HardwareDescriptor, IbrobotError, SceneObject, Vector
-from ibrobot_core.app import Plugins, RobotConfig, RunView, Subscription
+from ibrobot_core.api import Float64MultiArray, IbrobotError, SceneObject, Vector
+from ibrobot_core.app import RobotConfig, RunView, Subscription
 
 SHAPES = "/world/shapes"
 _POSE_SIZE = 7
@@ -24,7 +24,7 @@ class SceneObjects:
     def __init__(self, session: RunView) -> None:
         self._session = session
         try:
-            self._things = simulated_objects(session.config, session.registry) if session.config.simulated else []
+            self._things = simulated_objects(session.config) if session.config.simulated else []
         except IbrobotError as error:
             _log.warning("the page shows no objects of the scene: %s", error)
             self._things = []
@@ -80,7 +80,7 @@ def _half(kind: str, size: Sequence[float]) -> list[float]:
             return [round(float(size[0]), 4), round(float(size[1]) / 2, 4), 0.0]
 
 
-def simulated_objects(config: RobotConfig, registry: Plugins) -> list[SceneObject]:
+def simulated_objects(config: RobotConfig) -> list[SceneObject]:
     """The objects of a robot's simulation, without the ground; none if it has no simulation.
 
     Raises:
@@ -88,10 +88,7 @@ def simulated_objects(config: RobotConfig, registry: Plugins) -> list[SceneObjec
     """
     if config.simulation is None:
         return []
-    descriptor = registry.find("hardware", config.simulation.type)
-    assert isinstance(descriptor, HardwareDescriptor)
-    scene = descriptor.scene(config.simulation.options, config.robot)
-    return [each for each in scene if each.shape != "plane"]
+    return [each for each in config.simulation.options.scene_objects(config.robot) if each.shape != "plane"]
 
 
 def mounts(peripherals: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import attrs
 from ibrobot_http.addresses import check_name, is_loopback
 
-from ibrobot_core.api import documented, option
+from ibrobot_core.api import OptionFault, Options, documented, option
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Robot
 
 LEAST_PASSWORD = 12
 """Shortest password of a page on the network [characters]."""
@@ -15,7 +20,7 @@ LEAST_PASSWORD = 12
 
 @documented
 @attrs.frozen
-class WebOptions:
+class WebOptions(Options):
     """Options of the viewer `type: web`."""
 
     host: str = option(
@@ -46,10 +51,16 @@ class WebOptions:
         if self.password is not None and len(self.password) < LEAST_PASSWORD:
             raise ValueError(f"password must have at least {LEAST_PASSWORD} characters")
 
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+        """Check that the files of the certificate exist."""
+        for name, path in (("certificate", self.certificate), ("key", self.key)):
+            if path is not None and not path.is_file():
+                yield OptionFault((name,), f"{path}: no such file")
+
 
 @documented
 @attrs.frozen
-class WebTeleopOptions:
+class WebTeleopOptions(Options):
     """Options of the teleop `type: web`; the joints' limits bound every speed."""
 
     joint_speed: float = option(0.8, unit="rad/s", gt=0, help="speed of joints")

@@ -184,7 +184,7 @@ class Playback:
         try:
             self.description(find)
             document = json.loads(self.summary.metadata["config"])
-            things = simulated_objects(from_document(document, source=self._path, sim=True), installed_plugins())
+            things = simulated_objects(from_document(document, source=self._path, sim=True))
         except (IbrobotError, KeyError, ValueError):  # the episode says too little, or its plugins are missing
             return []
         moving = {each.topic for each in things if each.topic} & {

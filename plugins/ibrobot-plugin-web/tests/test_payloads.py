@@ -24,7 +24,6 @@ from ibrobot_web.status import LogLines, numbers_of, plan_json, status_json
 
 from ibrobot_core.api import (
     Float64MultiArray,
-    HardwareDescriptor,
     Header,
     Image,
     Imu,
@@ -186,11 +185,9 @@ def test_objects_of_a_simulated_scene_are_where_the_simulation_has_them() -> Non
         SceneObject("cube", "box", (0.2, 0.2, 0.2), here, "/simulation/scene", 2, (0.8, 0.1, 0.1234567, 1.0)),
     )
     session = make_session()
-    make: Any = None
-    descriptor = HardwareDescriptor("sim", make=make, summary="", scene=lambda options, robot: things)
-    config = SimpleNamespace(simulated=True, simulation=SimpleNamespace(type="sim", options=None), robot=None)
-    registry = SimpleNamespace(find=lambda kind, name: descriptor)
-    objects: Any = SceneObjects(SimpleNamespace(bus=session.bus, config=config, registry=registry))
+    options = SimpleNamespace(scene_objects=lambda robot: things)
+    config = SimpleNamespace(simulated=True, simulation=SimpleNamespace(options=options), robot=None)
+    objects: Any = SceneObjects(SimpleNamespace(bus=session.bus, config=config))
     assert [(each["name"], each["pos"]) for each in objects.json()] == [("bin", [1, 2, 3]), ("cube", [1, 2, 3])]
     session.bus.publish("/simulation/scene", Float64MultiArray(np.array([9.0, 9.0, 0.5, 0.6, 0.7, 0.0, 1.0, 0.0, 0.0])))
     bin_, cube = objects.json()

@@ -2,22 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
 
 from ibrobot_core.api import Check, Late, TeleopDescriptor, hookimpl
-from ibrobot_webxr.options import WebxrOptions, check_robot
-
-if TYPE_CHECKING:
-    from ibrobot_core.api import OperatorEvent, OptionFault, Robot
-
-
-def _check(options: WebxrOptions, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-    return check_robot(options, robot)
-
-
-def _events(options: WebxrOptions) -> Collection[OperatorEvent]:
-    return ("start", "success", "failure", "discard", "intervention")
+from ibrobot_webxr.options import WebxrOptions
 
 
 @hookimpl
@@ -27,9 +15,6 @@ def ibrobot_teleop() -> Iterable[TeleopDescriptor]:
         type="webxr",
         options=WebxrOptions,
         make=Late("ibrobot_webxr.teleop:WebxrTeleop"),
-        check_options=_check,
-        events=_events,
-        peripherals=lambda options: [(("cameras", i), name) for i, name in enumerate(options.cameras)],
         label="drive with a phone or VR controller",
         summary="moves the tool with a phone, a VR controller or a hand, through a web page",
     )

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import attrs
 from ibrobot_http.addresses import check_name
 
-from ibrobot_core.api import OptionFault, did_you_mean, documented, option
+from ibrobot_core.api import OptionFault, Options, did_you_mean, documented, option
 
 if TYPE_CHECKING:
-    from ibrobot_core.api import Robot
+    from ibrobot_core.api import OperatorEvent, Robot
 
 HANDS = ("left", "right")
 """The hands of an operator, as WebXR calls them; on a phone the page asks which arm it drives."""
@@ -34,7 +34,7 @@ def _check_host(instance: Any, attribute: attrs.Attribute[Any], value: str) -> N
 
 @documented
 @attrs.frozen
-class WebxrOptions:
+class WebxrOptions(Options):
     """Options of `type: webxr`; the joints' own limits bound every speed."""
 
     host: str = option(
@@ -94,14 +94,21 @@ class WebxrOptions:
         if self.names and self.port == 0:
             raise ValueError("port 0, any free port, is for tests on this machine: names needs a fixed port")
 
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+        """Check that the robot has a model and the gripper, and that the certificate exists."""
+        if robot.description.mjcf is None:
+            yield OptionFault((), "a hand moves the tool, which needs robot.description.mjcf: set it", "mjcf")
+        if self.gripper not in (NONE, *robot.groups):
+            known = did_you_mean(self.gripper, (*robot.groups, NONE), "the groups are")
+            yield OptionFault(("gripper",), f"unknown group {self.gripper!r}{known}; `{NONE}` if nothing grips")
+        for name, path in (("certificate", self.certificate), ("key", self.key)):
+            if path is not None and not path.is_file():
+                yield OptionFault((name,), f"{path}: no such file; `ibrobot certs` makes certificates and keys")
 
-def check_robot(options: WebxrOptions, robot: Robot) -> Iterator[OptionFault]:
-    """Check that the robot has a model and the gripper, and that the certificate exists."""
-    if robot.description.mjcf is None:
-        yield OptionFault((), "a hand moves the tool, which needs robot.description.mjcf: set it", "mjcf")
-    if options.gripper not in (NONE, *robot.groups):
-        known = did_you_mean(options.gripper, (*robot.groups, NONE), "the groups are")
-        yield OptionFault(("gripper",), f"unknown group {options.gripper!r}{known}; `{NONE}` if nothing grips")
-    for name, path in (("certificate", options.certificate), ("key", options.key)):
-        if path is not None and not path.is_file():
-            yield OptionFault((name,), f"{path}: no such file; `ibrobot certs` makes certificates and keys")
+    def events(self) -> Collection[OperatorEvent]:
+        """The buttons of the page."""
+        return ("start", "success", "failure", "discard", "intervention")
+
+    def peripherals(self) -> Iterable[tuple[tuple[str | int, ...], str]]:
+        """Its cameras."""
+        return [(("cameras", i), name) for i, name in enumerate(self.cameras)]

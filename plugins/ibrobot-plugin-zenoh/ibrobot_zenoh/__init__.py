@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 from ibrobot_terminal import PanelDescriptor
 
 from ibrobot_core.api import DecoderDescriptor, Late, TransportDescriptor, hookimpl
 from ibrobot_core.app import Command
-from ibrobot_zenoh.options import Share, ZenohOptions, check_files, server_options
+from ibrobot_zenoh.options import ZenohOptions, server_options
 
 
 @hookimpl
@@ -20,22 +20,8 @@ def ibrobot_transports() -> Iterable[TransportDescriptor]:
         make=Late("ibrobot_zenoh.transport:ZenohTransport"),
         default=True,
         listen=server_options,
-        components=lambda options, session, link: Late("ibrobot_zenoh.sharing:components")(
-            options.share, session, link
-        ),
-        used=lambda options: options.share != Share(),
-        check_options=check_files,
-        publishes=_subscribed,
-        offers=lambda options, service: options.share.offers(service),
         summary="between machines, including ROS 2 nodes with rmw_zenoh",
     )
-
-
-def _subscribed(options: ZenohOptions) -> list[tuple[tuple[str | int, ...], str]]:
-    """The topics of other machines, each with its key in the options."""
-    topics = options.share.subscribe
-    keys: Iterable[str | int] = topics if isinstance(topics, Mapping) else range(len(topics))
-    return [(("share", "subscribe", key), topic) for key, topic in zip(keys, topics, strict=True)]
 
 
 @hookimpl(optionalhook=True)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import ipaddress
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import attrs
 
-from ibrobot_core.api import OptionFault, did_you_mean, documented, option
+from ibrobot_core.api import Late, OptionFault, Options, did_you_mean, documented, option
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
+    from ibrobot_core.app import Component, RunView, TransportLink
 
 MIB = 1024 * 1024
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
@@ -157,7 +158,7 @@ class Share:
 
 @documented
 @attrs.frozen
-class ZenohOptions:
+class ZenohOptions(Options):
     """Options of `type: zenoh`."""
 
     share: Share = option(factory=Share, help="topics and services shared with other machines")
@@ -229,12 +230,31 @@ class ZenohOptions:
         if not re.fullmatch(r"(/?[A-Za-z_][A-Za-z0-9_]*)*", self.namespace or ""):
             raise ValueError(f"namespace {self.namespace!r} is not a ROS 2 name, e.g. robot1 or lab/robot1")
 
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+        """Check that the files in the self exist."""
+        files: dict[tuple[str, ...], Path | None] = {("settings",): self.settings, ("users",): self.users}
+        if self.tls is not None:
+            files |= {("tls", name): path for name, path in attrs.asdict(self.tls).items()}
+        for key, path in files.items():
+            if path is not None and not path.is_file():
+                yield OptionFault(key, f"no such file: {path}")
 
-def check_files(options: ZenohOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
-    """Check that the files in the options exist."""
-    files: dict[tuple[str, ...], Path | None] = {("settings",): options.settings, ("users",): options.users}
-    if options.tls is not None:
-        files |= {("tls", name): path for name, path in attrs.asdict(options.tls).items()}
-    for key, path in files.items():
-        if path is not None and not path.is_file():
-            yield OptionFault(key, f"no such file: {path}")
+    def publishes(self) -> list[tuple[tuple[str | int, ...], str]]:
+        """The topics of other machines, each with its key in the self."""
+        topics = self.share.subscribe
+        keys: Iterable[str | int] = topics if isinstance(topics, Mapping) else range(len(topics))
+        return [(("share", "subscribe", key), topic) for key, topic in zip(keys, topics, strict=True)]
+
+    def offers(self, service: str) -> bool:
+        """Whether other machines may call a service."""
+        return self.share.offers(service)
+
+    @property
+    def used(self) -> bool:
+        """Whether it shares anything."""
+        return self.share != Share()
+
+    def components(self, run: RunView, link: TransportLink) -> Sequence[Component]:
+        """What shares topics, services and actions."""
+        shared: Sequence[Component] = Late("ibrobot_zenoh.sharing:components")(self.share, run, link)
+        return shared

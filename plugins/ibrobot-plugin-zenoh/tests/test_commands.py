@@ -29,8 +29,8 @@ from ibrobot_core.api import (
     IbrobotError,
     JointState,
     Message,
-    NoOptions,
     NotSupported,
+    Options,
     Robot,
 )
 from ibrobot_core.app import ConfigError, RequestError, RobotConfig
@@ -211,7 +211,7 @@ def test_the_network_of_a_config(options: dict[str, Any], connect: tuple[str, ..
     assert network_module.options_from("robot", ("tcp/other:1",), 9).connect == ("tcp/other:1",)
 
 
-@pytest.mark.parametrize("transport", [None, TransportConfig("local", NoOptions())])
+@pytest.mark.parametrize("transport", [None, TransportConfig("local", Options())])
 def test_a_config_without_network(transport: TransportConfig | None, monkeypatch: pytest.MonkeyPatch):
     use_config(monkeypatch, transport)
     with pytest.raises(NotSupported, match=r"has (no transport|transport local); topics are shared by transport"):

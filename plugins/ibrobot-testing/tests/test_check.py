@@ -16,17 +16,17 @@ from ibrobot_core.app import RequestError, Unsuccessful, installed_plugins
 
 PLUGIN = """
 import attrs
-from ibrobot_core.api import Late, TeleopDescriptor, hookimpl, option
+from ibrobot_core.api import Late, TeleopDescriptor, Options, hookimpl, option
 
 
 @attrs.frozen
-class Options:
+class Given(Options):
     gain: float = option(1.0, ge=0, help="how fast")
 
 
 @hookimpl
 def ibrobot_teleop():
-    yield TeleopDescriptor("wave", Late("ibrobot_testing.fakes.host:FakeTeleop"), "waves", options=Options)
+    yield TeleopDescriptor("wave", Late("ibrobot_testing.fakes.host:FakeTeleop"), "waves", options=Given)
 """
 REQUIRES = "ibrobot-core>=0.1,<0.2"
 

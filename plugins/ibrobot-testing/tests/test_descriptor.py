@@ -12,7 +12,7 @@ from ibrobot_core.api import (
     Descriptor,
     ExecutorDescriptor,
     HardwareDescriptor,
-    NoOptions,
+    Options,
     SensorDescriptor,
     StreamOptions,
 )
@@ -26,6 +26,11 @@ def wrong(descriptor: Descriptor[Any], **members: Any) -> Descriptor[Any]:
     return attrs.evolve(descriptor, **members)
 
 
+def answering(**answers: object) -> type[Options]:
+    """A class of options with these answers."""
+    return type("Answering", (Options,), answers)
+
+
 ARM = HardwareDescriptor("arm", make, "an arm")
 EYE = SensorDescriptor("eye", make, "an eye")
 FOLLOWS = ExecutorDescriptor("follows", make, "follows", StreamOptions, streams=True)
@@ -37,8 +42,8 @@ FOLLOWS = ExecutorDescriptor("follows", make, "follows", StreamOptions, streams=
         ARM,
         EYE,
         FOLLOWS,
-        attrs.evolve(ARM, calibration=lambda options: "arm", anchored=lambda options: ("gripper",)),
-        attrs.evolve(EYE, picture=lambda options: (480, 640)),
+        attrs.evolve(ARM, options=answering(calibration="arm", anchored=("gripper",))),
+        attrs.evolve(EYE, options=answering(picture=(480, 640))),
         ExecutorDescriptor("grips", make, "grips", goals="position"),
     ],
 )
@@ -51,17 +56,18 @@ def test_right_descriptors_pass(descriptor: Descriptor[Any]) -> None:
     [
         (wrong(ARM, summary=""), "summary is empty"),
         (wrong(ARM, options=StreamOptions), "is not a StreamOptions"),
-        (wrong(ARM, devices=lambda options: {"port": 1}), "devices: "),
-        (wrong(ARM, calibration=lambda options: ""), "calibration must be a name"),
-        (wrong(ARM, anchored=lambda options: "gripper"), "must be a tuple of joints, got 'gripper'"),
-        (wrong(ARM, anchored=lambda options: ("a", "a")), "names a joint twice"),
-        (wrong(EYE, picture=lambda options: (480, 640, 3)), "picture must be height and width"),
-        (wrong(EYE, picture=lambda options: (480.0, 640)), "picture must be height and width"),
-        (wrong(EYE, picture=lambda options: (0, 640)), "picture must be height and width"),
-        (wrong(FOLLOWS, options=NoOptions), "must derive from StreamOptions"),
-        (wrong(FOLLOWS, options=NoOptions, streams=False, goals="pose"), "goals is 'pose'"),
+        (wrong(ARM, options=answering(devices=lambda options: {"port": 1})), "devices: "),
+        (wrong(ARM, options=answering(calibration="")), "calibration must be a name"),
+        (wrong(ARM, options=answering(anchored="gripper")), "must be a tuple of joints, got 'gripper'"),
+        (wrong(ARM, options=answering(anchored=("a", "a"))), "names a joint twice"),
+        (wrong(EYE, options=answering(picture=(480, 640, 3))), "picture must be height and width"),
+        (wrong(EYE, options=answering(picture=(480.0, 640))), "picture must be height and width"),
+        (wrong(EYE, options=answering(picture=(0, 640))), "picture must be height and width"),
+        (wrong(FOLLOWS, options=Options), "must derive from StreamOptions"),
+        (wrong(FOLLOWS, options=Options, streams=False, goals="pose"), "goals is 'pose'"),
     ],
 )
 def test_a_wrong_member_is_found(descriptor: Descriptor[Any], what: str) -> None:
+    options = Options() if what == "is not a StreamOptions" else descriptor.options()
     with pytest.raises(AssertionError, match=what):
-        check_descriptor(descriptor, NoOptions())
+        check_descriptor(descriptor, options)

@@ -6,19 +6,19 @@ from typing import override
 
 import attrs
 
-from ibrobot_core.api import Int32, String, hookimpl, option
+from ibrobot_core.api import Int32, Options, String, hookimpl, option
 from ibrobot_core.app import CONTROL, NoRequest, SectionDescriptor, Service, SessionWorker
 
 RESET_COUNT = Service("/reset_count", NoRequest, str, "Count from 0 again.")
 
 
 @attrs.frozen
-class CounterOptions:
+class CounterOptions(Options):
     topic: str = option("/count", help="where the count goes")
 
 
 @attrs.frozen
-class GreeterOptions:
+class GreeterOptions(Options):
     word: str = option("hello", help="what it says")
 
 

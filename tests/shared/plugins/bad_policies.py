@@ -14,6 +14,7 @@ import numpy as np
 from ibrobot_testing.fakes import FakeHardware, FakePolicy, FakeSensor
 
 from ibrobot_core import hookimpl
+from ibrobot_core.api import Options
 from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor, SensorDescriptor
 from ibrobot_core.options import option
 
@@ -27,7 +28,7 @@ class Reach(FakeHardware):
 
 
 @attrs.frozen(kw_only=True)
-class BadOptions:
+class BadOptions(Options):
     """What is wrong with the policy."""
 
     how: str = option(

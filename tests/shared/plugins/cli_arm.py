@@ -7,6 +7,7 @@ from typing import Never
 import attrs
 
 from ibrobot_core import hookimpl
+from ibrobot_core.api import Options
 from ibrobot_core.descriptors import Command, HardwareDescriptor, SensorDescriptor
 from ibrobot_core.errors import HardwareError
 from ibrobot_core.options import option
@@ -18,7 +19,7 @@ class Servo:
 
 
 @attrs.frozen
-class Options:
+class GivenOptions(Options):
     port: str = option(help="serial port")
     max_speed: float = option(3.0, unit="rad/s", gt=0, le=6.5, help="speed limit of the servos")
     mode: str = option("soft", choices=("soft", "hard"), help="how it holds")
@@ -32,7 +33,7 @@ def unused(options: object, ctx: object) -> Never:
 
 @hookimpl
 def ibrobot_hardware():
-    yield HardwareDescriptor("fake_arm", unused, "an arm of thin air", Options)
+    yield HardwareDescriptor("fake_arm", unused, "an arm of thin air", GivenOptions)
 
 
 @hookimpl

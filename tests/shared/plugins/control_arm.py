@@ -10,6 +10,7 @@ import attrs
 from ibrobot_testing.fakes import FakeHardware, FakeTrajectoryExecutor
 
 from ibrobot_core import hookimpl
+from ibrobot_core.api import Options
 from ibrobot_core.descriptors import ExecutorDescriptor, HardwareDescriptor
 from ibrobot_core.errors import HardwareError
 from ibrobot_core.interfaces.hardware import Holding
@@ -52,7 +53,7 @@ class Arm(FakeHardware):
 
 
 @attrs.frozen
-class Options:
+class GivenOptions(Options):
     trouble: str = option("", help="when it fails")
     closed: str = option("", help="file made when it is released")
     fork: bool = option(False, help="whether a process forked by it outlives it")
@@ -62,7 +63,7 @@ class Options:
 
 @hookimpl
 def ibrobot_hardware():
-    yield HardwareDescriptor("arm", Arm, "an arm", Options, simulated=True)
+    yield HardwareDescriptor("arm", Arm, "an arm", GivenOptions, simulated=True)
 
 
 @hookimpl

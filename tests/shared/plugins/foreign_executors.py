@@ -8,12 +8,12 @@ from typing import Any
 import attrs
 from ibrobot_testing.fakes import FakeExecutor
 
-from ibrobot_core.api import Context, ExecutorDescriptor, hookimpl, option
+from ibrobot_core.api import Context, ExecutorDescriptor, Options, hookimpl, option
 
 
 @attrs.frozen
-class Options:
-    """Options that derive from nothing."""
+class GivenOptions(Options):
+    """GivenOptions that derive from nothing."""
 
     stiffness: float = option(1.0, help="of nothing")
 
@@ -24,4 +24,4 @@ def nearest(options: Any, ctx: Context) -> FakeExecutor:
 
 @hookimpl
 def ibrobot_executors() -> Iterator[ExecutorDescriptor]:
-    yield ExecutorDescriptor("nearest", nearest, "follows the nearest point of a plan", Options, streams=True)
+    yield ExecutorDescriptor("nearest", nearest, "follows the nearest point of a plan", GivenOptions, streams=True)

@@ -8,12 +8,13 @@ from typing import Never
 import attrs
 
 from ibrobot_core import hookimpl
+from ibrobot_core.api import Options
 from ibrobot_core.descriptors import Check, ConfigFile, HardwareDescriptor
 from ibrobot_core.options import option
 
 
 @attrs.frozen
-class Options:
+class GivenOptions(Options):
     port: str = option(help="serial port")
 
 
@@ -23,7 +24,7 @@ def unused(options: object, ctx: object) -> Never:
 
 @hookimpl
 def ibrobot_hardware():
-    yield HardwareDescriptor("good_arm", unused, "an arm that works", Options)
+    yield HardwareDescriptor("good_arm", unused, "an arm that works", GivenOptions)
 
 
 @hookimpl

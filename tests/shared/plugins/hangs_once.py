@@ -12,11 +12,12 @@ from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
 
 from ibrobot_core import hookimpl
+from ibrobot_core.api import Options
 from ibrobot_core.descriptors import PolicyDescriptor
 
 
 @attrs.frozen
-class Options:
+class GivenOptions(Options):
     path: Path
 
 
@@ -34,4 +35,4 @@ class HangsOnce(FakePolicy):
 
 @hookimpl
 def ibrobot_policies():
-    yield PolicyDescriptor("hangs_once", HangsOnce, "hangs at its first request", Options)
+    yield PolicyDescriptor("hangs_once", HangsOnce, "hangs at its first request", GivenOptions)

@@ -19,6 +19,7 @@ from ibrobot_testing.fakes import (
 )
 
 from ibrobot_core import hookimpl
+from ibrobot_core.api import Options
 from ibrobot_core.descriptors import (
     Descriptor,
     EngineDescriptor,
@@ -179,7 +180,7 @@ class Lost(Net):
 
 
 @attrs.frozen
-class FarOptions:
+class FarOptions(Options):
     server: str = option("", help="where the model is")
 
 
@@ -190,9 +191,10 @@ class Far(FakeEngine):
         self.options, self.name = options, ctx.name
 
 
-def is_plugged_in(options):
-    if TROUBLE.get("unplugged"):
-        raise MissingDependency("/dev/video0: there is no such device", remedy="plug it in")
+class DrawnOptions(Options):
+    def find_device(self):
+        if TROUBLE.get("unplugged"):
+            raise MissingDependency("/dev/video0: there is no such device", remedy="plug it in")
 
 
 def can_draw():
@@ -217,7 +219,7 @@ def ibrobot_hardware():
 @hookimpl
 def ibrobot_sensors():
     yield SensorDescriptor("webcam", make(Camera), "a camera")
-    yield SensorDescriptor("drawn", make(Camera), "a camera in the scene", check=can_draw, find=is_plugged_in)
+    yield SensorDescriptor("drawn", make(Camera), "a camera in the scene", DrawnOptions, check=can_draw)
     yield SensorDescriptor("imu", make(Camera), "a sensor of a kind of its own", kind="imu", check=can_draw)
 
 

@@ -13,6 +13,7 @@ import attrs
 from ibrobot_testing.fakes import FakePolicy, FakeRealHardware, FakeSensor, FakeTeleop
 
 from ibrobot_core import hookimpl
+from ibrobot_core.api import Options
 from ibrobot_core.control import host, pose_motion
 from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor, SensorDescriptor, TeleopDescriptor
 from ibrobot_core.errors import PolicyError, SensorError
@@ -65,7 +66,7 @@ class Arm(FakeRealHardware):
 
 
 @attrs.frozen
-class ArmOptions:
+class ArmOptions(Options):
     log: str = option(help="file")
     trouble: bool = option(False, help="whether it has a bug")
     fork: bool = option(False, help="whether a child outlives the control process")
@@ -123,7 +124,7 @@ class Swing(FakeTeleop):
 
 
 @attrs.frozen
-class SwingOptions:
+class SwingOptions(Options):
     fork: bool = option(False, help="whether a child outlives the host")
     thread: str = option("", help="how a thread of it dies: raise, exit")
     trouble: str = option("", help="what happens after three seconds: block, exit, main, link")

@@ -11,14 +11,22 @@ from ibrobot_zenoh.options import Share
 from ibrobot_zenoh.sharing import components
 
 from ibrobot_core import hookimpl
+from ibrobot_core.api import Options
 from ibrobot_core.descriptors import TransportDescriptor
 from ibrobot_core.errors import TransportError
 from ibrobot_core.options import option
 
 
 @attrs.frozen
-class NetworkOptions:
+class NetworkOptions(Options):
     share: Share = option(factory=Share)
+
+    @property
+    def used(self):
+        return self.share != Share()
+
+    def components(self, run, link):
+        return components(self.share, run, link)
 
 
 class Network(FakeTransport, TopicTransport):
@@ -70,6 +78,4 @@ def ibrobot_transports():
         make,
         "a network",
         NetworkOptions,
-        used=lambda options: options.share != Share(),
-        components=lambda options, session, link: components(options.share, session, link),
     )

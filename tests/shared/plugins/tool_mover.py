@@ -7,6 +7,7 @@ from typing import Any
 import attrs
 import numpy as np
 
+from ibrobot_core.api import Options
 from ibrobot_core.descriptors import PolicyDescriptor
 from ibrobot_core.hookspecs import hookimpl
 from ibrobot_core.interfaces import Policy, PolicySpec
@@ -19,7 +20,7 @@ STEP = (0.001, 0.002, -0.001)
 
 @documented
 @attrs.frozen
-class MoverOptions:
+class MoverOptions(Options):
     """Options of the policy."""
 
     chunk_size: int = option(1, help="number of actions")

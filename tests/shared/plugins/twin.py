@@ -9,11 +9,12 @@ from typing import Never
 import attrs
 
 from ibrobot_core import hookimpl
+from ibrobot_core.api import Options
 from ibrobot_core.descriptors import ConfigFile, HardwareDescriptor
 
 
 @attrs.frozen
-class Options:
+class GivenOptions(Options):
     """No options."""
 
 
@@ -23,7 +24,7 @@ def unused(options: object, ctx: object) -> Never:
 
 @hookimpl
 def ibrobot_hardware() -> Iterator[HardwareDescriptor]:
-    yield HardwareDescriptor("good_arm", unused, "another of that name", Options)
+    yield HardwareDescriptor("good_arm", unused, "another of that name", GivenOptions)
 
 
 @hookimpl

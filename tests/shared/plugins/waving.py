@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ibrobot_core.api import NoOptions, Teleop, TeleopCommand, TeleopDescriptor, hookimpl
+from ibrobot_core.api import Options, Teleop, TeleopCommand, TeleopDescriptor, hookimpl
 
 
 class Waving(Teleop):
@@ -33,4 +33,4 @@ class Waving(Teleop):
 
 @hookimpl
 def ibrobot_teleop():
-    yield TeleopDescriptor(type="waving", options=NoOptions, make=Waving, summary="waves")
+    yield TeleopDescriptor(type="waving", options=Options, make=Waving, summary="waves")

@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from ibrobot_core.api import PolicyDescriptor
-from ibrobot_mujoco.experts.options import ExpertOptions, SortExpertOptions, check_arm, check_arms
+from ibrobot_mujoco.experts.options import ExpertOptions, HandoverExpertOptions, SortExpertOptions
 from ibrobot_mujoco.gl import check_asked
 
 if TYPE_CHECKING:
@@ -35,7 +35,6 @@ def _expert(
         type=name,
         options=options,
         make=make,
-        check_options=check_arms if scene == "handover" else check_arm,
         summary=f"{summary}, by inverse kinematics and the scene's ground truth",
     )
 
@@ -44,7 +43,13 @@ EXPERTS = (
     _expert("pick_cube", "PickTask", "picks the cube and puts it into the bin", lambda _: 10, type_="scripted_pick"),
     _expert("push", "PushTask", "pushes the block onto the goal", lambda _: 10),
     _expert("stack", "StackTask", "puts the cube on the other one", lambda _: 14),
-    _expert("handover", "HandoverTask", "hands the bar from the left arm to the right one", lambda _: 7),
+    _expert(
+        "handover",
+        "HandoverTask",
+        "hands the bar from the left arm to the right one",
+        lambda _: 7,
+        HandoverExpertOptions,
+    ),
     _expert("drawer", "DrawerTask", "opens the drawer", lambda _: 6),
     _expert(
         "sort",

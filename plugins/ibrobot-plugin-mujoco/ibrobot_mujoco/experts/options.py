@@ -7,15 +7,24 @@ from typing import TYPE_CHECKING
 
 import attrs
 
-from ibrobot_core.api import OptionFault, documented, option
+from ibrobot_core.api import OptionFault, Options, documented, option
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
 
 
+_ONE_ARM = OptionFault(("actions",), "the robot has several arms: `tool` is for one arm")
+
+
+def _gripper_faults(robot: Robot, name: str) -> Iterator[OptionFault]:
+    gripper = robot.groups.get(name, ())
+    if len(gripper) != 1:
+        yield OptionFault((), f"the scripted expert needs one joint in robot.groups.{name}, got {list(gripper)}")
+
+
 @documented
 @attrs.frozen
-class ExpertOptions:
+class ExpertOptions(Options):
     """Options of a scripted expert. The gripper's positions suit the SO-101 and objects of 2 to 3 cm."""
 
     chunk_size: int = option(50, ge=1, le=1000, help="number of actions in a chunk")
@@ -32,6 +41,12 @@ class ExpertOptions:
         "for one arm",
     )
 
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+        """Check that the robot has a gripper with one joint."""
+        yield from _gripper_faults(robot, "gripper")
+        if self.actions == "tool" and robot.description.arms:
+            yield _ONE_ARM
+
 
 @documented
 @attrs.frozen
@@ -42,20 +57,16 @@ class SortExpertOptions(ExpertOptions):
     gripper_open: float = option(0.4, unit="rad", help="position of the open gripper")
 
 
-def check_arm(
-    options: ExpertOptions, robot: Robot, joints: tuple[str, ...], name: str = "gripper"
-) -> Iterator[OptionFault]:
-    """Check that the robot has a gripper with one joint."""
-    gripper = robot.groups.get(name, ())
-    if len(gripper) != 1:
-        yield OptionFault((), f"the scripted expert needs one joint in robot.groups.{name}, got {list(gripper)}")
-    if options.actions == "tool" and (name != "gripper" or robot.description.arms):
-        yield OptionFault(("actions",), "the robot has several arms: `tool` is for one arm")
+@documented
+@attrs.frozen
+class HandoverExpertOptions(ExpertOptions):
+    """Options of the expert with two arms."""
 
-
-def check_arms(options: ExpertOptions, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
-    """Check that the robot has two arms, each with a gripper with one joint."""
-    for name in ("left", "right"):
-        yield from check_arm(options, robot, joints, f"{name}_gripper")
-        if name not in robot.groups:
-            yield OptionFault((), f"the scripted expert needs robot.groups.{name}, the joints of that arm")
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
+        """Check that the robot has two arms, each with a gripper with one joint."""
+        for name in ("left", "right"):
+            yield from _gripper_faults(robot, f"{name}_gripper")
+            if name not in robot.groups:
+                yield OptionFault((), f"the scripted expert needs robot.groups.{name}, the joints of that arm")
+        if self.actions == "tool":
+            yield _ONE_ARM

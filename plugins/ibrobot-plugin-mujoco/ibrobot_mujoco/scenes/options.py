@@ -6,7 +6,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import documented, option
+from ibrobot_core.api import Options, documented, option
 from ibrobot_mujoco.spans import Range, Span, ordered, span
 
 _TURN = 3.14159
@@ -14,7 +14,7 @@ _TURN = 3.14159
 
 @documented
 @attrs.frozen(kw_only=True)
-class SceneOptions:
+class SceneOptions(Options):
     """Options of every scene. Each episode draws from a range `[lowest, highest]`; a number fixes the value."""
 
     friction: Span = span(1.0, ge=0.05, le=3.0, help="sliding friction of objects, table and jaws, relative to 1")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import attrs
 
-from ibrobot_core.api import documented, option
+from ibrobot_core.api import Options, documented, option
 
 
 @documented
 @attrs.frozen
-class TrajectoryOptions:
+class TrajectoryOptions(Options):
     """Options of `type: trajectory`; a tolerance of 0 is not checked."""
 
     path_tolerance: float = option(0.0, unit="rad", ge=0, help="largest deviation on the way, beyond a lag of 0.1 s")
@@ -19,7 +19,7 @@ class TrajectoryOptions:
 
 @documented
 @attrs.frozen
-class GripperOptions:
+class GripperOptions(Options):
     """Options of `type: gripper`."""
 
     goal_tolerance: float = option(0.01, unit="rad", gt=0, help="deviation at which the goal counts as reached")

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Literal
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Literal
 
 import attrs
 
-from ibrobot_core.api import documented, option
+from ibrobot_core.api import OptionFault, Options, documented, option
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Robot
 
 
 @documented
 @attrs.frozen
-class ClearanceGuardOptions:
+class ClearanceGuardOptions(Options):
     """The guard `clearance`: stops in front of the arm itself and of the objects of the section `world`."""
 
     margin: float = option(0.003, unit="m", ge=0, le=0.2, help="least distance of the arm from objects")
@@ -35,3 +38,8 @@ class ClearanceGuardOptions:
         "hold",
         help="when a part of the world is too old, whose own rule is `refuse`: brake and hold, or keep what was seen",
     )
+
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+        """Check that the robot has a model."""
+        if robot.description.mjcf is None:
+            yield OptionFault((), "the guard needs robot.description.mjcf: set it, or leave control.guard out", "mjcf")

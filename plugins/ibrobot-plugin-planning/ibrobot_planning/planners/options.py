@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
 import attrs
 
-from ibrobot_core.api import documented, option
+from ibrobot_core.api import OptionFault, Options, documented, option
+
+if TYPE_CHECKING:
+    from ibrobot_core.api import Robot
 
 
 @documented
 @attrs.frozen
-class JointPlannerOptions:
+class JointPlannerOptions(Options):
     """Options of `type: joint`."""
 
     velocity_scaling: float = option(1.0, gt=0, le=1, help="fraction of the velocity limits for a scaling of 1.0")
@@ -22,7 +28,7 @@ class JointPlannerOptions:
 
 @documented
 @attrs.frozen
-class GoalCheckOptions:
+class GoalCheckOptions(Options):
     """The section `goals`: how far trajectories of any client keep away, in modes whose planner does not say so."""
 
     padding: float = option(0.005, unit="m", ge=0, le=0.1, help="minimum distance of the arm from objects")
@@ -34,7 +40,7 @@ class GoalCheckOptions:
 
 @documented
 @attrs.frozen
-class RrtConnectOptions:
+class RrtConnectOptions(Options):
     """Options of `type: rrt_connect`."""
 
     padding: float = option(0.005, unit="m", ge=0, le=0.1, help="minimum distance of the arm from objects")
@@ -61,3 +67,8 @@ class RrtConnectOptions:
         ge=0,
         help="how deep the arm may overlap something at the start; from there it moves only outwards",
     )
+
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+        """Check that the robot has a model."""
+        if robot.description.mjcf is None:
+            yield OptionFault((), "planning around obstacles needs robot.description.mjcf: set it", "mjcf")

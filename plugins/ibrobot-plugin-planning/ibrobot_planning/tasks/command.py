@@ -89,7 +89,7 @@ def _read(file: str, parameters: tuple[str, ...]) -> TaskFile:
 
 def _checked(file: TaskFile, robot: RobotConfig, registry: Registry) -> CheckedTask:
     """Check a task without a run, with the objects at their first poses."""
-    scene = scene_objects(robot, registry)
+    scene = scene_objects(robot)
     section = robot.plugin_sections.get(SECTION)
     world = first_world(section.options, scene) if section is not None else None
     # The seed of the run places these.

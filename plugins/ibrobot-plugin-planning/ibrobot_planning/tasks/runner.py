@@ -177,7 +177,7 @@ class TaskRunner(SessionWorker):
 
     def _checked(self, file: TaskFile) -> CheckedTask:
         session = self.session
-        config, scene = session.config, scene_objects(session.config, session.registry)
+        config, scene = session.config, scene_objects(session.config)
         why = ""
         if config.recording is None:
             why = "the robot YAML has no section `recording`"

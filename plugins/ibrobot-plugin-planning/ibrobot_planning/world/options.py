@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import attrs
 
-from ibrobot_core.api import documented, option
+from ibrobot_core.api import OptionFault, Options, did_you_mean, documented, option
 
 if TYPE_CHECKING:
+    from ibrobot_core.api import Robot
     from ibrobot_planning.world.objects import WorldObject
 
 FURTHEST = 1000.0
@@ -139,7 +140,7 @@ class CloudOptions:
 
 @documented
 @attrs.frozen
-class WorldOptions:
+class WorldOptions(Options):
     """The section `world`: the objects around the robot, for planners."""
 
     objects: Mapping[str, ObjectOptions] = option(factory=dict, help="objects by name")
@@ -155,6 +156,55 @@ class WorldOptions:
         """The same world without clouds and limits of ages, for plans without a run, in which nothing is measured."""
         objects = {name: attrs.evolve(thing, max_age=None) for name, thing in self.objects.items()}
         return attrs.evolve(self, objects=objects, clouds={}, scene_when_stale="keep")
+
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+        """Check that the objects have sensible sizes and that meshes can be read."""
+        for name, thing in self.objects.items():
+            try:
+                thing.made()
+            except ValueError as error:
+                yield OptionFault(("objects", name), str(error))
+        yield from self._unknown_names(robot)
+        for name, cloud in self.clouds.items():
+            if name in self.objects:
+                yield OptionFault(
+                    ("clouds", name), f"there is an object {name!r} already; clouds need names of their own"
+                )
+            if cloud.max_age <= 1 / cloud.rate:
+                yield OptionFault(
+                    ("clouds", name, "max_age"),
+                    f"{cloud.max_age:g} s is too small for rate {cloud.rate:g} Hz: the cells would be too old before "
+                    f"the next update; set it above {1 / cloud.rate:g} s, or rate above {1 / cloud.max_age:g} Hz",
+                )
+
+    def _unknown_names(self, robot: Robot) -> Iterable[OptionFault]:
+        """Faults of names that are neither a link of the robot's model nor an object."""
+        from ibrobot_kinematics.errors import KinematicsError
+        from ibrobot_kinematics.mjcf_names import read_names
+
+        from ibrobot_planning.world.objects import FLOOR
+
+        mjcf = robot.description.mjcf
+        if mjcf is None:
+            return
+        try:
+            model = read_names(mjcf)
+        except KinematicsError:
+            return  # its own check reports it
+        prefixes = tuple(robot.description.arms) or ("",)
+        links = [prefix + name for prefix in prefixes for name in ("world", *model.bodies, *model.sites)]
+        known = [*links, *self.objects, *self.clouds, FLOOR]
+        for name, thing in self.objects.items():
+            if name in links:
+                yield OptionFault(("objects", name), f"a link of {mjcf.name} has this name already")
+            if thing.link is not None and thing.link not in links:
+                yield OptionFault(
+                    ("objects", name, "link"), f"unknown link {thing.link!r}{did_you_mean(thing.link, links, 'known')}"
+                )
+            for i, other in enumerate(thing.may_touch):
+                if other not in known and not self.scene:  # objects of the scene are checked at the start
+                    message = f"unknown link or object {other!r}{did_you_mean(other, known, 'known')}"
+                    yield OptionFault(("objects", name, "may_touch", i), message)
 
 
 def _short(instance: object, attribute: attrs.Attribute[str], value: str) -> None:

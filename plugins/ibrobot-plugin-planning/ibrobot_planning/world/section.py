@@ -15,7 +15,6 @@ from ibrobot_kinematics.poses import matrix, pose, pose_at
 
 from ibrobot_core.api import (
     Float64MultiArray,
-    HardwareDescriptor,
     PlanningError,
     Pose,
     Quaternion,
@@ -25,7 +24,7 @@ from ibrobot_core.api import (
     did_you_mean,
     resolve_path,
 )
-from ibrobot_core.app import Component, NoRequest, PlanCode, Plugins, RobotConfig, RunView, Service, Subscription
+from ibrobot_core.app import Component, NoRequest, PlanCode, RobotConfig, RunView, Service, Subscription
 from ibrobot_planning.world.ages import Age, Limit, Unusable
 from ibrobot_planning.world.objects import (
     FLOOR,
@@ -83,14 +82,12 @@ _STILL = 1e-4
 """Smaller changes of an object's position [m] and axes do not count as motion."""
 
 
-def scene_objects(config: RobotConfig, registry: Plugins) -> tuple[SceneObject, ...]:
+def scene_objects(config: RobotConfig) -> tuple[SceneObject, ...]:
     """The objects of the simulated scene that the world of a robot has: none without `scene: true`, or on hardware."""
     section = config.plugin_sections.get(SECTION)
     if section is None or not section.options.scene or not config.simulated or config.simulation is None:
         return ()
-    descriptor = registry.find("hardware", config.simulation.type)
-    assert isinstance(descriptor, HardwareDescriptor)
-    return tuple(descriptor.scene(config.simulation.options, config.robot))
+    return tuple(config.simulation.options.scene_objects(config.robot))
 
 
 def first_world(options: WorldOptions, scene: Sequence[SceneObject]) -> World:
@@ -165,7 +162,7 @@ class WorldKeeper(Component):
     """
 
     def __init__(self, options: WorldOptions, session: RunView) -> None:
-        scene = scene_objects(session.config, session.registry)
+        scene = scene_objects(session.config)
         self._world = first_world(options, scene)
         super().__init__("world", f"{len(self._world.objects)} objects for planners", ())
         self._session = session

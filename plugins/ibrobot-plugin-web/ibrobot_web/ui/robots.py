@@ -111,9 +111,7 @@ def _facts(config: RobotConfig) -> dict[str, Any]:
     registry = installed_plugins()
     hardware = {} if config.simulated else config.hardware
     devices = {
-        f"{name}: {what}": device
-        for name, each in hardware.items()
-        for what, device in registry.find("hardware", each.type).devices(each.options).items()
+        f"{name}: {what}": device for name, each in hardware.items() for what, device in each.options.devices().items()
     }
     modes = modes_json(config, registry, terminal=False)
     recording = config.recording

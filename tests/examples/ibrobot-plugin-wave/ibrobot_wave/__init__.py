@@ -9,6 +9,7 @@ import attrs
 from ibrobot_core.api import (
     Context,
     JointReading,
+    Options,
     Teleop,
     TeleopCommand,
     TeleopDescriptor,
@@ -20,7 +21,7 @@ from ibrobot_core.api import (
 
 
 @attrs.frozen
-class WaveOptions:
+class WaveOptions(Options):
     """What the YAML may say."""
 
     joint: str = option("wrist_flex", help="the joint that waves")
