@@ -106,7 +106,6 @@ from ibrobot_core.interfaces.reader import (
     TopicSummary as TopicSummary,
     Recorded as Recorded,
 )
-from ibrobot_core.files import replace_file as replace_file, sync as sync
 
 # The contract
 from ibrobot_core.contract.specs import (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.errors import GoalRejected
 from ibrobot_core.interfaces import Executor, JointReading, Plan
-from ibrobot_core.interfaces.executor import ExecutorGoal
+from ibrobot_core.interfaces.executor import ExecutorGoal, SlowDown
 from ibrobot_core.interfaces.run_state import PlanRecord
 from ibrobot_core.robot import Robot, Vector
 
@@ -105,11 +105,13 @@ class ActiveExecutors:
         Raises:
             GoalRejected: if the executor is not active or rejects the goal.
         """
-        active = {owned.name: owned for owned in self._active}
-        if executor not in active:
-            raise GoalRejected(f"executor {executor!r} is not active; active: {', '.join(active) or 'none'}")
+        owned = next((each for each in self._active if each.name == executor), None)
+        if owned is None:
+            active = ", ".join(each.name for each in self._active)
+            raise GoalRejected(f"executor {executor!r} is not active; active: {active or 'none'}")
+        reading = self._at_rest(owned, measured) if isinstance(goal, SlowDown) else owned.reading(measured)
         try:
-            active[executor].executor.set_goal(goal_id, goal, active[executor].reading(measured))
+            owned.executor.set_goal(goal_id, goal, reading)
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
             # A goal comes from outside, and an executor from a plugin: neither may end the loop.
             raise GoalRejected(f"{executor}: the goal is malformed: {type(error).__name__}: {error}") from error
@@ -126,10 +128,14 @@ class ActiveExecutors:
 
     def _brake(self, owned: _Owned, measured: JointReading) -> Vector:
         """Stop an executor that streams: its joints brake at once; returns where they come to rest [rad]."""
-        rest = self._rest()[owned.columns]
-        owned.executor.activate(attrs.evolve(owned.reading(measured), position=rest))
+        reading = self._at_rest(owned, measured)
+        owned.executor.activate(reading)
         self._streamed.discard(owned.name)
-        return rest
+        return reading.position
+
+    def _at_rest(self, owned: _Owned, measured: JointReading) -> JointReading:
+        """A reading whose positions are where the joints come to rest if they brake now."""
+        return attrs.evolve(owned.reading(measured), position=self._rest()[owned.columns])
 
     def _report_goals(self, owned: _Owned) -> None:
         while (status := owned.executor.pop_status()) is not None:

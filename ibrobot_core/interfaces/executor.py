@@ -69,11 +69,17 @@ class MoveJoint:
     position: float
     max_effort: float = 0.0
     """[Nm]; 0: no limit."""
+    speed: float = 1.0
+    """Fraction of the joint's velocity limit that its setpoint may use."""
 
 
 @attrs.frozen
 class SlowDown:
-    """Slow down along the present goal, and hold; a goal for executors with any goals."""
+    """Slow down along the present goal, and hold; a goal for executors with any goals.
+
+    Its `measured` positions are those at which the commands come to rest if they brake now. Setpoints may be far ahead
+    of them, e.g. if an agent's authority limits the speed or the guard holds a joint back: hold there, then.
+    """
 
     stop: Literal[True] = True
 

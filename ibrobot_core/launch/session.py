@@ -22,7 +22,7 @@ from ibrobot_core.control import commands
 from ibrobot_core.control.host import ControlHost
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError, MissingDependency
 from ibrobot_core.interfaces import Context, JointReading, OperatorEvent, run_state
-from ibrobot_core.interfaces.executor import ExecutorGoal
+from ibrobot_core.interfaces.executor import ExecutorGoal, MoveJoint
 from ibrobot_core.interfaces.run import CommandSource, LaunchRequest
 from ibrobot_core.launch.absence import absent_sensors, by_cause
 from ibrobot_core.launch.authority import Authority
@@ -240,6 +240,8 @@ class Session:
             with self.authority.lock:  # no goal overtakes the end of an agent's authority
                 if self.held:
                     raise HardwareError(f"refused: holding: {self.to_go_on()}")
+                if isinstance(checked, MoveJoint):  # its setpoint must not run ahead of the commands
+                    checked = attrs.evolve(checked, speed=min(checked.speed, self.authority.speed))
                 self.control.call(commands.SendGoal(executor, goal_id, checked, stops, generation))
 
         send(goal) if self.goal_door is None else self.goal_door(executor, goal_id, goal, send)

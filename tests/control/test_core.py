@@ -152,6 +152,19 @@ class TestGoals:
         assert "error" in rig.call(attrs.evolve(GOAL, goal=SlowDown()))
         assert rig.events("goal") == []
 
+    def test_to_slow_down_come_with_where_the_commands_come_to_rest(self, make_rig, monkeypatch):
+        rig = make_rig({}).start("plan")
+        rig.call(GOAL)
+        rig.tick(10)
+        readings = []
+        executor = rig.core._executors._all["arm_trajectory"].executor
+        monkeypatch.setattr(executor, "set_goal", lambda *goal: readings.append(goal[-1]))
+        rig.call(attrs.evolve(GOAL, goal=SlowDown()))
+
+        rest = rig.core._safety.rest[:2]
+        np.testing.assert_array_equal(readings[0].position, rest)
+        assert (rest > rig.core.state.command[:2]).all()
+
     def test_end_with_the_mode_or_a_cancel(self, make_rig):
         rig = make_rig({}).start("plan")
         for end in (CancelGoals(), SwitchMode("stream")):

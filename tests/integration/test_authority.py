@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ibrobot_core.api import Header, JointState
+from ibrobot_core.api import Header, JointState, MoveJoint
 from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
 from ibrobot_core.contract.specs import joint_selection
 from ibrobot_core.errors import ContractError, HardwareError, IbrobotError, NotSupported, RequestError, TransportError
@@ -25,8 +25,8 @@ AWAY, HERE = "shoulder_pan=1.2", "shoulder_pan=0"
 class AgentRun:
     """A run in lockstep with an agent, whose client gives signs of life at each tick, unless it is `frozen`."""
 
-    def __init__(self, scene: str = "empty") -> None:
-        overrides = (f"simulation.scene={{type: {scene}}}",)
+    def __init__(self, scene: str = "empty", *more: str) -> None:
+        overrides = (f"simulation.scene={{type: {scene}}}", *more)
         config = load_config(
             CONFIG, sim=True, mode="moveit_planning", overrides=overrides, registry=installed_plugins()
         )
@@ -76,6 +76,13 @@ class AgentRun:
 @pytest.fixture
 def run() -> Iterator[AgentRun]:
     made = AgentRun()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def task_run() -> Iterator[AgentRun]:
+    made = AgentRun("empty", "tasks={}")
     yield made
     made.close()
 
@@ -308,6 +315,40 @@ def test_gripper_keeps_to_the_region(run: AgentRun, out: float, within: float) -
     assert run.moved(200) == 0.0
     run.go(f"gripper={within}")
     assert run.moved(200) > 0.09
+
+
+@pytest.mark.parametrize("speed", [0.02, 0.25])
+@pytest.mark.parametrize(
+    ("cancel", "service", "request_"),
+    [
+        ("/planning/cancel", GO_TO, "gripper=1.7"),
+        ("/planning/cancel", GO_TO, "shoulder_pan=1.2,gripper=1.7"),
+        ("/task/cancel", "/task/run", "steps:\n- gripper: {position: 1.7}"),
+        ("/task/cancel", "/task/run", "steps:\n- move: {joints: {shoulder_pan: 1.2}}"),
+        ("/task/cancel", "/task/step", {"gripper": {"position": 1.7}}),
+    ],
+)
+def test_cancel_stops_a_slow_gripper_as_it_stops_the_arm(
+    task_run: AgentRun, cancel: str, service: str, request_: Any, speed: float
+) -> None:
+    run = task_run
+    run.grant(services=(service,), speed=speed)
+    run.authority.call(run.agent, service, request_)
+    assert run.moved(50) > 0.005
+    run.authority.call(run.agent, cancel)
+    run.ticks(20)
+    assert run.commands[-1][5] < 0.6
+    assert run.moved(200) == 0.0
+
+
+def test_gripper_of_another_client_keeps_to_the_speed_that_is_granted(run: AgentRun) -> None:
+    run.grant(speed=0.1)
+    run.session.send_goal("gripper_action", "of another", MoveJoint(1.7))
+    run.ticks(50)
+    run.session.cancel_goals("gripper_action")
+    run.ticks(5)
+    assert run.commands[-1][5] < 0.2
+    assert run.moved(200) == 0.0
 
 
 def policy(run: AgentRun, speed: float = 1.0, **more: Any) -> None:

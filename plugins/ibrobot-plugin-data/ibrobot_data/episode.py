@@ -19,6 +19,7 @@ import numpy as np
 from ibrobot_calibration import Calibration, JointCalibration
 from ibrobot_calibration.joint_units import policy_units
 from ibrobot_provenance.datasets import DatasetWriter
+from ibrobot_provenance.files import sync
 from ibrobot_provenance.ownership import Ownership
 from numpy.typing import NDArray
 
@@ -35,7 +36,6 @@ from ibrobot_core.api import (
     RealClock,
     RecorderError,
     Robot,
-    sync,
 )
 from ibrobot_core.app import TASK_KEY, DiskFull, installed_plugins
 from ibrobot_data.commanders import Commanders, stretches

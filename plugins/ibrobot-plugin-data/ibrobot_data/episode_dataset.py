@@ -8,9 +8,10 @@ from tempfile import TemporaryFile
 from typing import Any
 
 import yaml
+from ibrobot_provenance.files import replace_file
 from ibrobot_provenance.ownership import Ownership, owned
 
-from ibrobot_core.api import Contract, IbrobotError, RecorderError, replace_file
+from ibrobot_core.api import Contract, IbrobotError, RecorderError
 from ibrobot_core.app import installed_plugins
 
 _WAIT_S = 10.0

@@ -13,9 +13,10 @@ from typing import Any
 
 import attrs
 import numpy as np
+from ibrobot_provenance.files import replace_file
 from numpy.typing import NDArray
 
-from ibrobot_core.api import Contract, DatasetError, replace_file
+from ibrobot_core.api import Contract, DatasetError
 from ibrobot_diagnose.alignment import shift_of
 from ibrobot_diagnose.course import delay_of
 from ibrobot_diagnose.pictures import SMALL, Grey, background, descriptors, grey, nearest, png, read_png

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ibrobot_provenance.files import replace_file
 from ibrobot_provenance.report_page import as_page
 from ibrobot_provenance.reports import Case, Cases, Plots, ReportSection, Table, Text
 from ibrobot_provenance.svg import axis_of, caption, grid_below, grid_beside, svg, tag
 
-from ibrobot_core.api import DatasetError, replace_file
+from ibrobot_core.api import DatasetError
 from ibrobot_diagnose.cause import Finding, Shown
 from ibrobot_diagnose.options import REPORT
 from ibrobot_diagnose.pictures import png

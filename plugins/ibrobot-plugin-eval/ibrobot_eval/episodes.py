@@ -13,17 +13,9 @@ from uuid import uuid4
 
 import attrs
 from ibrobot_provenance.code import differing_code, installed_code
+from ibrobot_provenance.files import replace_file
 
-from ibrobot_core.api import (
-    MODEL_ANSWERS,
-    Contract,
-    DatasetError,
-    Message,
-    ModelAnswer,
-    RecorderError,
-    replace_file,
-    seconds,
-)
+from ibrobot_core.api import MODEL_ANSWERS, Contract, DatasetError, Message, ModelAnswer, RecorderError, seconds
 from ibrobot_core.app import (
     ComponentFailed,
     LaunchRequest,

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import attrs
+from ibrobot_provenance.files import replace_file
 
-from ibrobot_core.api import OptionFault, did_you_mean, replace_file
+from ibrobot_core.api import OptionFault, did_you_mean
 from ibrobot_lerobot_devices.link import INSTALL, DeviceLink, DeviceProblem, is_installed
 from ibrobot_lerobot_devices.options import GRIPPER
 

@@ -13,9 +13,10 @@ import attrs
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from ibrobot_provenance.files import sync
 from ibrobot_provenance.ownership import Ownership, owned
 
-from ibrobot_core.api import DatasetError, sync
+from ibrobot_core.api import DatasetError
 from ibrobot_lerobot import layout
 from ibrobot_lerobot.arrow import table_of, to_array, to_numpy
 from ibrobot_lerobot.episode import counter_stats, stats_columns, write_meta

@@ -8,9 +8,8 @@ from typing import Any
 
 import attrs
 import yaml
+from ibrobot_provenance.files import replace_file
 from ibrobot_ros2 import type_hash
-
-from ibrobot_core.api import replace_file
 
 METADATA = "metadata.yaml"
 INFORMATION = "rosbag2_bagfile_information"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from typing import Any
 
+import attrs
 import numpy as np
 import pytest
 from ibrobot_planning.executors.gripper import GripperExecutor
@@ -59,6 +60,13 @@ class Jaw:
 
     def close(self, position: float = 0.0, goal_id: str = "close", **more: Any) -> None:
         self.executor.set_goal(goal_id, MoveJoint(position, **more), self.reading())
+
+    def stop(self, rest: float | None = None) -> None:
+        """Let it slow down; commands that brake now come to `rest`, by default those that follow the setpoint."""
+        ticks = int(abs(self.velocity) / 0.4)
+        braking = np.copysign(ticks * (abs(self.velocity) * 0.01 - (ticks + 1) * 0.002), self.velocity)
+        at = self.setpoint + float(braking) if rest is None else rest
+        self.executor.set_goal("stop", SlowDown(), attrs.evolve(self.reading(), position=np.array([at])))
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / 0.01)):
@@ -225,7 +233,7 @@ def test_stop_slows_down_and_holds() -> None:
     jaw.close(0.0)
     jaw.run(0.1)
     before = jaw.setpoint
-    jaw.executor.set_goal("stop", SlowDown(), jaw.reading())
+    jaw.stop()
     jaw.run(0.1)
     assert jaw.setpoint == pytest.approx(before - 2.0**2 / (2 * 40), abs=0.012)
     assert jaw.velocity == 0
@@ -235,6 +243,40 @@ def test_stop_slows_down_and_holds() -> None:
         ("stop", GoalState.EXECUTING),
         ("stop", GoalState.SUCCEEDED),
     ]
+
+
+@pytest.mark.parametrize(("target", "rest"), [(0.0, 0.95), (1.7, 1.05)])
+def test_stop_holds_where_the_commands_come_to_rest_though_the_setpoint_is_ahead(target: float, rest: float) -> None:
+    jaw = Jaw(start=1.0, velocity=2.0)
+    jaw.close(target)
+    jaw.run(0.2)
+    assert abs(jaw.setpoint - 1.0) > 0.3
+    jaw.stop(rest)
+    jaw.run(0.01)
+    assert jaw.setpoint == rest
+    jaw.run(1.0)
+    assert jaw.setpoint == rest
+    assert [(s.goal_id, s.state) for s in jaw.statuses()][-1] == ("stop", GoalState.SUCCEEDED)
+
+
+def test_goal_keeps_to_its_fraction_of_the_velocity_limit() -> None:
+    jaw = Jaw(start=1.0)
+    jaw.close(0.0, speed=0.1)
+    jaw.run(0.5)
+    assert jaw.velocity == pytest.approx(-0.4)
+    jaw.close(1.7, "open")
+    jaw.run(0.3)
+    assert jaw.velocity == pytest.approx(2.0)
+
+
+def test_gripper_that_may_only_creep_has_not_stalled() -> None:
+    jaw = Jaw(start=1.0, stall_velocity=0.05, stall_time=0.1)
+    jaw.close(0.9, speed=0.005)
+    jaw.run(1.0)
+    assert jaw.statuses() == [GoalStatus("close", GoalState.EXECUTING)]
+    jaw.blocked_at = jaw.position
+    jaw.run(0.2)
+    assert jaw.statuses()[0].result["stalled"] is True
 
 
 def test_deactivation_ends_the_goal() -> None:
@@ -251,6 +293,9 @@ def test_deactivation_ends_the_goal() -> None:
     [
         (FollowTrajectory(JointTrajectory(Header(), ("jaw",), ())), "expected a position, got FollowTrajectory("),
         (MoveJoint(float("nan")), "position must be a finite number, got nan"),
+        (MoveJoint(0.0, speed=0.0), "speed is 0; it must be a fraction above 0, up to 1"),
+        (MoveJoint(0.0, speed=1.5), "speed is 1.5; it must be a fraction"),
+        (MoveJoint(0.0, speed=float("nan")), "speed must be a finite number, got nan"),
         (MoveJoint(2.0), "position 2 rad is outside the limits of jaw, -0.2 to 1.7"),
         *(
             (MoveJoint(1.0, value), f"max_effort must be a finite number, got {value!r}")

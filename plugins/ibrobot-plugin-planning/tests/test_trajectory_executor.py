@@ -462,7 +462,7 @@ def test_deactivation_ends_the_goal() -> None:
 AT_REST = (0.0, 0.0)
 BAD: dict[str, Any] = {
     "the trajectory has no points; it needs at least one": goal(),
-    "expected a trajectory, got MoveJoint(position=0.1, max_effort=0.0)": MoveJoint(0.1),
+    "expected a trajectory, got MoveJoint(position=0.1, max_effort=0.0, speed=1.0)": MoveJoint(0.1),
     "the points have efforts; only positions, velocities and accelerations are followed": goal(
         attrs.evolve(point(1, AT_REST), effort=AT_REST)
     ),

@@ -9,10 +9,11 @@ import attrs
 import cv2
 import numpy as np
 import yaml
+from ibrobot_provenance.files import replace_file
 from numpy.typing import NDArray
 
 from ibrobot_camera.intrinsics.views import CELLS, View, by_size
-from ibrobot_core.api import SensorError, replace_file
+from ibrobot_core.api import SensorError
 
 FEWEST_VIEWS = 10
 MOST_RMS_PX = 1.0

@@ -66,8 +66,10 @@ class GripperExecutor(Executor):
         self._options = options
         joint = ctx.robot.joints[int(ctx.robot.indices(ctx.joints)[0])]
         self._lower, self._upper = joint.lower, joint.upper
-        period_s = seconds(ctx.period_ns)
-        self._fastest = min(options.velocity, joint.max_velocity) * period_s
+        self._period_s = period_s = seconds(ctx.period_ns)
+        self._max_step = joint.max_velocity * period_s
+        self._fastest = self._most = min(options.velocity * period_s, self._max_step)
+        """Largest step of the setpoint [rad], of any goal and of the present one."""
         self._change = _SHARE * joint.max_acceleration * period_s**2
         self._stall_ns = ns(options.stall_time)
         # Longer pauses are missed ticks: a gripper that stood without setpoints has not stalled.
@@ -104,12 +106,15 @@ class GripperExecutor(Executor):
         if math.isnan(self._setpoint):
             raise GoalRejected("the executor is not active")
         if isinstance(goal, SlowDown):
+            rest = float(measured.position[0])
+            if abs(self._setpoint + self._braking_distance() - rest) > self._fastest:  # the commands lag behind
+                self._setpoint, self._step = rest, 0.0
             self._begin(_Running(goal_id, stops=True), self._setpoint + self._braking_distance())
             return
         if not isinstance(goal, MoveJoint):
             raise GoalRejected(f"expected a position, got {goal}")
-        position, max_effort = goal.position, goal.max_effort
-        for name, value in (("position", position), ("max_effort", max_effort)):
+        position, max_effort, speed = goal.position, goal.max_effort, goal.speed
+        for name, value in (("position", position), ("max_effort", max_effort), ("speed", speed)):
             if not math.isfinite(value):
                 raise GoalRejected(f"{name} must be a finite number, got {value!r}")
         if not self._lower <= position <= self._upper:
@@ -121,8 +126,10 @@ class GripperExecutor(Executor):
             raise GoalRejected(f"max_effort is {max_effort:.6g} Nm; it must be from 0, for no limit, to {_STRONGEST:g}")
         if max_effort > 0 and not np.isfinite(measured.effort[0]):
             raise GoalRejected(f"max_effort cannot be kept: {self.joints[0]} has no measured effort; leave it out")
+        if not 0 < speed <= 1:
+            raise GoalRejected(f"speed is {speed:.6g}; it must be a fraction above 0, up to 1")
         self._begin(_Running(goal_id), position)
-        self._max_effort = max_effort
+        self._max_effort, self._most = max_effort, min(self._fastest, speed * self._max_step)
 
     def _begin(self, goal: _Running, target: float) -> None:
         self._end(GoalState.CANCELED, f"replaced by goal {goal.goal_id}")
@@ -167,7 +174,7 @@ class GripperExecutor(Executor):
         gap = self._target - self._setpoint
         # From a step u, then u - D, u - 2 D, …, the setpoint comes to rest within the gap.
         ticks = math.floor((math.sqrt(1 + 8 * abs(gap) / self._change) - 1) / 2)
-        most = min(abs(gap) / (ticks + 1) + ticks * self._change / 2, self._fastest)
+        most = min(abs(gap) / (ticks + 1) + ticks * self._change / 2, self._most)
         return min(max(math.copysign(most, gap), self._step - self._change), self._step + self._change)
 
     def _judge(self, running: _Running, measured: JointReading, passed_ns: int) -> None:
@@ -176,8 +183,9 @@ class GripperExecutor(Executor):
             if self._setpoint == self._target or self._step == 0:
                 self._end(GoalState.SUCCEEDED, "", self._result(measured))
             return
-        # Written so that a NaN speed counts as moving: a stall must be measured.
-        moves = not abs(measured.velocity[0]) < self._options.stall_velocity
+        # Written so that a NaN speed counts as moving: a stall must be measured. A gripper that may only creep has not
+        # stalled.
+        moves = not abs(measured.velocity[0]) < min(self._options.stall_velocity, self._most / self._period_s / 2)
         running.still_ns = 0 if moves else running.still_ns + passed_ns
         if abs(measured.position[0] - self._target) <= self._options.goal_tolerance:
             self._end(GoalState.SUCCEEDED, "", self._result(measured, reached_goal=True))

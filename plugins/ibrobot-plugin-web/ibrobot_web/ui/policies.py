@@ -7,7 +7,9 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-from ibrobot_core.api import IbrobotError, replace_file
+from ibrobot_provenance.files import replace_file
+
+from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import ConfigError, find_config, from_document, installed_plugins, parse_yaml
 from ibrobot_web.model_edit import ModelEdit, with_model
 from ibrobot_web.ui.context import Routes, Ui

@@ -10,18 +10,9 @@ from pathlib import Path
 from typing import Any, override
 
 import attrs
+from ibrobot_provenance.files import replace_file
 
-from ibrobot_core.api import (
-    NS_PER_S,
-    Context,
-    EpisodeEnd,
-    EpisodeStart,
-    JointState,
-    Message,
-    Recorder,
-    RecorderError,
-    replace_file,
-)
+from ibrobot_core.api import NS_PER_S, Context, EpisodeEnd, EpisodeStart, JointState, Message, Recorder, RecorderError
 from ibrobot_jointlog.log import LOG, METADATA, TOPIC, header, row
 
 _FLUSH_NS = NS_PER_S

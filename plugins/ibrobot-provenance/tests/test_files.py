@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import pytest
-
-from ibrobot_core.api import replace_file
+from ibrobot_provenance.files import replace_file
 
 
 @pytest.mark.parametrize("content", ["ä", "ä".encode(), lambda file: file.write("ä".encode())])
