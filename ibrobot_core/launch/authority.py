@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import json
 import threading
+from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from contextvars import ContextVar
@@ -32,6 +33,8 @@ AGENT_LOG = "/agent/log"
 """std_msgs/msg/String: JSON with what agents ask for, who grants it, and how it ends."""
 _MOST_REQUEST = 2_000
 """Longest request in the log, in characters."""
+_NOTES_PER_S, _NOTES = 0.2, 50.0
+"""Events of the log that move nothing and give nothing, e.g. refused calls and stops: on average, and at once."""
 _TOLERANCE = 1e-3
 """How far a number may be outside of the region, in its unit, and a speed above that granted, as a fraction."""
 
@@ -125,6 +128,11 @@ class Authority:
         self._ended = ""
         self.told: list[Callable[[Mapping[str, Any]], object]] = []
         """Called with each event of the log, which others cannot forge, as they can messages on a topic."""
+        self._noting = threading.Lock()
+        self._room, self._noted_ns = _NOTES, session.clock.now_ns()
+        """How many events of those that are bounded may come at once, at that time."""
+        self._left_out: Counter[str] = Counter()
+        """Events that had no room since the last one of the log."""
         self.speed = 1.0
         """Fraction of the velocity limits that motions must keep to now."""
 
@@ -139,6 +147,8 @@ class Authority:
         for service in (ARM, DISARM, STATUS):
             self._session.bus.unserve(service)
         self.end("the door for agents closes")
+        if self._left_out:
+            self._note("closed", Agent("", 0), kept=True)
 
     def join(self, name: str) -> Agent:
         """Connect an agent, which may then read and stop."""
@@ -191,7 +201,7 @@ class Authority:
             session.control.call(LimitSpeed(grant.speed))
             self.renew(scope.agent)
             self._called, self._left, self.speed, self._scope = {}, "", grant.speed, scope
-        self._note("armed", scope.agent, grant=attrs.asdict(grant))
+        self._note("armed", scope.agent, kept=True, grant=attrs.asdict(grant))
         return f"{scope.agent.name} may move the robot for {grant.seconds:g} s at {grant.speed:.0%} of its speed"
 
     def call(self, agent: Agent, name: str, request: Plain = None) -> Any:
@@ -209,22 +219,23 @@ class Authority:
             if service is not None and not (service.reads or service.urgent):
                 if service.persons:
                     raise NotSupported(f"{name} is for persons only: ask one")
-                grant = self._granted(agent, name)
-                if name not in grant.services:
-                    raise HardwareError(f"{name} is not granted; granted: {', '.join(grant.services) or 'nothing'}")
-                self._called[name] = service
+                granted = self._granted(agent, name)
+                if name not in granted.services:
+                    raise HardwareError(f"{name} is not granted; granted: {', '.join(granted.services) or 'nothing'}")
+                grant, self._called[name] = granted, service
             answer = self._session.bus.call(name, request)
             if grant is not None and self.status().grant is not grant:
                 if service is not None and service.cancel:  # it began after `end` has cancelled what was there
                     self._session.bus.call(service.cancel)
                 raise HardwareError(f"{name}: the authority ended during the call: {self._ended}")
         except Exception as error:
-            self._note("refused", agent, **facts, why=str(error)[:_MOST_REQUEST])
+            began = grant is not None and not isinstance(error, RequestError)
+            self._note("refused", agent, kept=began, **facts, why=str(error)[:_MOST_REQUEST])
             raise
         finally:
             ACTING.reset(token)
         if service is None or not service.reads:
-            self._note("called", agent, **facts)
+            self._note("called", agent, kept=grant is not None, **facts)
         return answer
 
     def _granted(self, agent: Agent, what: str) -> Grant:
@@ -275,7 +286,7 @@ class Authority:
             if scope is None:
                 return
             session.held, self.speed, self._ended = session.held or hold, 1.0, why
-        self._note("ended", scope.agent, why=why)
+        self._note("ended", scope.agent, kept=True, why=why)
         acts: list[Callable[[], object]] = [session.hold] if hold else []
         acts += [partial(session.bus.call, service.cancel) for service in self._called.values() if service.cancel]
         for act in acts:
@@ -327,10 +338,23 @@ class Authority:
                     return f"{name} would be {value:.3f}, granted is {low:g} to {high:g}"
         return ""
 
-    def _note(self, event: str, agent: Agent, **facts: Any) -> None:
-        """Log an event, and tell those who keep it, and the topic, which recordings have."""
+    def _note(self, event: str, agent: Agent, *, kept: bool = False, **facts: Any) -> None:
+        """Log an event: on the topic, which recordings have, in the terminal, and for those who keep it.
+
+        What may have moved the robot is `kept` whatever comes. Others are left out in a flood, and counted.
+        """
         entry = {"stamp_ns": self._session.clock.now_ns(), "event": event, "agent": agent.name, **facts}
+        with self._noting:
+            gained = seconds(entry["stamp_ns"] - self._noted_ns) * _NOTES_PER_S
+            self._room, self._noted_ns = min(_NOTES, self._room + gained), entry["stamp_ns"]
+            if not kept and self._room < 1.0:
+                self._left_out[event] += 1
+                return
+            self._room -= not kept
+            if self._left_out:
+                entry["left_out"], self._left_out = dict(self._left_out), Counter()
+        self._session.bus.publish(AGENT_LOG, String(json.dumps(entry, default=str)))
+        shown = " ".join(f"{key}={value}" for key, value in entry.items() if key not in ("stamp_ns", "event", "agent"))
+        self._session.log.info("agent %s: %s %s", agent.name, event, shown)
         for call in self.told:
             call(entry)
-        self._session.bus.publish(AGENT_LOG, String(json.dumps(entry, default=str)))
-        self._session.log.info("agent %s: %s", agent.name, " ".join([event, *(f"{k}={v}" for k, v in facts.items())]))

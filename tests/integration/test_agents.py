@@ -19,6 +19,7 @@ import pytest
 from ibrobot_mcp.door import AgentDoor
 from ibrobot_mcp.resources import Resources
 from ibrobot_mcp.stdio import Pipes
+from ibrobot_mcp.tokens import add_token
 from mcp import Client, StdioServerParameters
 
 from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
@@ -202,6 +203,7 @@ def test_arm_holds_when_its_agent_is_out_of_reach(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     overrides = ("simulation.scene={type: empty}", "mcp={}")
     config = load_config(
         CONFIGS / "so101_blind.yaml",
@@ -214,11 +216,12 @@ def test_arm_holds_when_its_agent_is_out_of_reach(tmp_path: Path, monkeypatch: p
     session = runtime.session
     door = next(each for each in runtime.plan.components if isinstance(each, AgentDoor))
     runtime.start()
+    token = add_token("claude")
     relay = Relay(int(door.url.split(":")[2].split("/")[0]))
 
     async def talk() -> None:
         url = f"http://127.0.0.1:{relay.port}/mcp"
-        headers = {"Authorization": f"Bearer {door.token}", "Host": door.url.split("/")[2]}
+        headers = {"Authorization": f"Bearer {token}", "Host": door.url.split("/")[2]}
         async with (
             httpx2.AsyncClient(headers=headers, timeout=httpx2.Timeout(PATIENCE_S)) as http,
             Client(streamable_http_client(url, http_client=http), mode=mode) as client,
@@ -341,9 +344,9 @@ def test_scripted_agent_does_ten_tasks_of_increasing_length(tmp_path: Path, mode
 def test_agents_read_the_robot_without_its_secrets(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AGENT_TOKEN", "hunter2-hunter2-hunter2")
     config = load_config(
-        CONFIGS / "so101_blind.yaml", sim=True, overrides=("mcp.token=${AGENT_TOKEN}",), registry=installed_plugins()
+        CONFIGS / "so101_blind.yaml", sim=True, overrides=("web.password=${AGENT_TOKEN}",), registry=installed_plugins()
     )
-    assert config.plugin_sections["mcp"].options.token == "hunter2-hunter2-hunter2"
+    assert config.plugin_sections["web"].options.password == "hunter2-hunter2-hunter2"
     text = Resources(Session(config, installed_plugins(), LaunchRequest(lockstep=True))).read("ibrobot://robot")[1]
     assert "hunter2" not in text
     assert "shoulder_pan" in text

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import suppress
 from contextvars import Context
 from pathlib import Path
 from typing import Any
@@ -422,3 +423,50 @@ def test_log_says_who_granted_and_what_was_asked_for(run: AgentRun) -> None:
 def test_unknown_services_are_named(run: AgentRun) -> None:
     with pytest.raises(TransportError, match="nobody serves /nothing"):
         run.authority.call(run.agent, "/nothing")
+
+
+@pytest.mark.parametrize("flood", ["refused", "stops", "other services", "malformed", "connections"])
+def test_log_is_bounded_in_a_flood_and_says_what_it_leaves_out(run: AgentRun, flood: str) -> None:
+    granted = flood in ("other services", "malformed")
+    if granted:
+        run.grant()
+    for _ in range(500):
+        if flood == "connections":
+            run.authority.leave(run.authority.join("another"))
+            continue
+        call = {"stops": "/planning/cancel", "other services": "/move_action"}.get(flood, GO_TO)
+        with suppress(IbrobotError):
+            run.authority.call(run.agent, call, {"goal": 3.0} if flood == "malformed" else AWAY * 200)
+    before = run.events()
+    assert 50 <= len(before) <= 55
+    assert sum(len(json.dumps(each)) for each in before) < 250_000
+    if granted:
+        run.session.bus.call(DISARM)
+    else:
+        run.grant()
+    (entry,) = run.events()
+    (left_out,) = entry["left_out"].values() if flood != "connections" else [sum(entry["left_out"].values())]
+    wanted = 1000 if flood == "connections" else 500
+    assert left_out + len(before) - 1 - granted == wanted
+    assert entry["event"] == ("ended" if granted else "armed")
+
+
+def test_log_has_all_that_moved_though_a_flood_comes_between(run: AgentRun) -> None:
+    other = run.authority.join("other")
+    run.grant(agent="1:claude")
+    for number in range(300):
+        run.go(f"shoulder_pan=0.{number:03}")
+        with suppress(IbrobotError):
+            run.authority.call(other, GO_TO, AWAY)
+    called = [each["request"] for each in run.events() if each["event"] == "called"]
+    assert called == [f'"shoulder_pan=0.{number:03}"' for number in range(300)]
+
+
+def test_what_is_left_out_last_is_said_at_the_end(run: AgentRun) -> None:
+    for _ in range(100):
+        run.authority.call(run.agent, "/planning/cancel")
+    told: list[Any] = []
+    run.authority.told.append(told.append)
+    run.authority.close()
+    assert [(each["event"], each["left_out"]) for each in told] == [("closed", {"called": 51})]
+    run.authority.open()

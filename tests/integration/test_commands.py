@@ -122,7 +122,7 @@ WRONG_FILES = {
 }
 """Command line -> the kinds of files that are right there."""
 WITHOUT_FILES = {
-    "agent arm", "agent disarm", "agent status",
+    "agent add", "agent arm", "agent disarm", "agent list", "agent remove", "agent status",
     "plugins check",
     "config schema", "plugins show", "doctor", "camera list", "damiao emulate", "feetech find-port", "netft emulate",
     "gamepad list",
@@ -251,6 +251,7 @@ JSON = {
     "plugins check attrs --json": 2,
     "plugins new teleop my_stick --out new --json": 0,
     "doctor --json": None,
+    "agent list --json": 0,
     "agent status --json": 2,
     "camera list --json": 0,
     "camera calibrate BAD --json": 2,

@@ -97,7 +97,7 @@ class HostileRun:
         self.step(5)
 
     def close(self) -> None:
-        self.server.close()
+        asyncio.run(self.server.close())
         self.authority.close()
         self.runtime.stop()
 

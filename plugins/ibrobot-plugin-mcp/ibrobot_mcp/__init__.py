@@ -25,6 +25,9 @@ def ibrobot_commands() -> Iterable[Command]:
     """`ibrobot mcp` and `ibrobot agent …`."""
     yield Command("mcp", Late("ibrobot_mcp.command:RunMcp"), "Run a robot for an agent, over standard input.")
     yield Command("agent", summary="Let an agent move a robot that runs here, and end that.")
+    yield Command("agent add", Late("ibrobot_mcp.commands:AddAgent"))
+    yield Command("agent remove", Late("ibrobot_mcp.commands:RemoveAgent"))
+    yield Command("agent list", Late("ibrobot_mcp.commands:ListAgents"))
     yield Command("agent arm", Late("ibrobot_mcp.commands:ArmAgent"))
     yield Command("agent disarm", Late("ibrobot_mcp.commands:DisarmAgent"))
     yield Command("agent status", Late("ibrobot_mcp.commands:ShowAgents"))

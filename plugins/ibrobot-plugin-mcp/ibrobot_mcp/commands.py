@@ -12,6 +12,7 @@ import attrs
 from ibrobot_core.api import IbrobotError, option
 from ibrobot_core.app import RequestError, confirm, echo
 from ibrobot_mcp.persons import ask, running
+from ibrobot_mcp.tokens import add_token, named_agents, remove_token
 
 MOVING = ("/planning/go_to", "/move_action", "/task/step", "/task/run")
 """What `ibrobot agent arm` grants by default, of what a run serves."""
@@ -66,6 +67,47 @@ class ArmAgent(_OfRun):
         if not self.yes and not confirm("Let the agent move the robot?", flag="--yes"):
             raise IbrobotError("nothing was granted")
         echo(ask(path, "/agent/arm", grant))
+
+
+@attrs.frozen(kw_only=True)
+class AddAgent:
+    """Make the token of an agent that connects by HTTP. It is shown once, and valid for all robots that you run.
+
+    The agent's program sends it as `Authorization: Bearer TOKEN`. Give each agent one of its own: a grant is for the
+    agent whose token it is. `ibrobot agent remove` takes it away.
+    """
+
+    name: str = option(typed="NAME", help="how the agent is called, e.g. claude")
+
+    def __call__(self) -> Any:
+        return {"agent": self.name, "token": add_token(self.name)}
+
+    def show(self, made: Mapping[str, Any]) -> None:
+        """Print it."""
+        echo(made["token"])
+
+
+@attrs.frozen(kw_only=True)
+class RemoveAgent:
+    """Take away the token of an agent. It is disconnected, and what it was granted ends."""
+
+    name: str = option(typed="NAME", help="the agent")
+
+    def __call__(self) -> None:
+        remove_token(self.name)
+
+
+@attrs.frozen(kw_only=True)
+class ListAgents:
+    """List the agents that have a token."""
+
+    def __call__(self) -> Any:
+        return {"agents": named_agents()}
+
+    def show(self, known: Mapping[str, Any]) -> None:
+        """Print them."""
+        for name in known["agents"]:
+            echo(name)
 
 
 @attrs.frozen(kw_only=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import secrets
 import threading
 from collections.abc import AsyncIterator
 from typing import override
@@ -16,7 +15,7 @@ from ibrobot_core.app import CONTROL, Pulse, RunView, SessionWorker, as_failure
 from ibrobot_mcp.audit import AuditFile, authority_of
 from ibrobot_mcp.options import McpOptions
 from ibrobot_mcp.persons import Persons
-from ibrobot_mcp.server import AgentServer
+from ibrobot_mcp.server import PIPES, AgentServer
 from ibrobot_mcp.stdio import Pipes, serve_pipes
 from ibrobot_mcp.web import http_server
 
@@ -33,7 +32,6 @@ class AgentDoor(SessionWorker):
     Attributes:
         pipes: standard input and output of `ibrobot mcp`; set before the start.
         url: address for agents, once started; empty without HTTP.
-        token: what they send as bearer token.
     """
 
     sends_stops = True
@@ -45,27 +43,25 @@ class AgentDoor(SessionWorker):
         self._authority = authority_of(session)
         self.pipes: Pipes | None = None
         self.url = ""
-        self.token = self._options.token or secrets.token_urlsafe(24)
 
     @override
     def setup(self) -> None:
-        audit = AuditFile(self.session)
-        self.on_end.callback(audit.close)
+        self._audit = AuditFile(self.session)
+        self.on_end.callback(self._audit.close)
         self._authority.open()
         self.on_end.callback(self._authority.close)
-        self._write = audit.write
         persons = Persons(self.session)
         self.on_end.callback(persons.close)
         thread = _ServerThread(self)
         self.on_end.callback(thread.close)
-        own = f" with the token {self.token}" if self.url and self._options.token is None else ""
-        where = f"{self.url}{own}" if self.url else "standard input"
+        where = f"{self.url}, each with a token by `ibrobot agent add NAME`" if self.url else "standard input"
         self.session.log.info("agents connect to %s; grant one authority by `ibrobot agent arm`", where)
 
     @override
     def work(self, timeout_s: float) -> None:
         self._authority.check()
-        self._write()
+        if trouble := self._audit.trouble:
+            self._authority.end(trouble)
         if timeout_s > 0:
             self.pause(min(timeout_s, _CHECK_S))
 
@@ -81,14 +77,14 @@ class AgentDoor(SessionWorker):
                 names = host_names(options.host, options.names)
                 listener = listen(options.host, options.port, names, tls=tls, of="mcp: ", any_port="port: 0")
                 self.url = f"{listener.url}/mcp"
-                await stack.enter_async_context(http_server(server, listener, self.token))
+                await stack.enter_async_context(http_server(server, listener))
             yield
 
     async def serve_pipes(self, server: AgentServer) -> None:
         """Serve the agent at the pipes, and end the run when it is gone."""
         if self.pipes is not None:
             await serve_pipes(server.protocol, self.pipes)
-            server.leave()
+            await server.leave(PIPES)
             self.session.log.info("the agent has closed its connection: the run ends")
             self.session.finish()
 
@@ -143,7 +139,7 @@ class _ServerThread:
                 ending = asyncio.create_task(self._ending.wait())
                 await _first_failure(ending, tasks)
         finally:
-            server.close()
+            await server.close()
 
     async def _beat(self) -> None:
         while True:

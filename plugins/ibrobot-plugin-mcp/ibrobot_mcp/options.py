@@ -14,8 +14,6 @@ from ibrobot_core.api import OptionFault, Options, documented, option
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
 
-LEAST_TOKEN = 16
-
 
 @documented
 @attrs.frozen
@@ -28,9 +26,6 @@ class McpOptions(Options):
     names: tuple[str, ...] = option(
         (), validator=attrs.validators.deep_iterable(check_name), help="further host names of this machine"
     )
-    token: str | None = option(
-        None, secret=True, help=f"bearer token of agents, {LEAST_TOKEN} characters or more; by default a new one"
-    )
     certificate: Path | None = option(None, help="TLS certificate, with the chain of its authority")
     key: Path | None = option(None, help="private key of the certificate")
 
@@ -42,8 +37,6 @@ class McpOptions(Options):
                 f"host {self.host} can be reached from the network, which needs TLS: give certificate and key, or use "
                 "127.0.0.1 and an SSH tunnel"
             )
-        if self.token is not None and len(self.token) < LEAST_TOKEN:
-            raise ValueError(f"token must have at least {LEAST_TOKEN} characters")
 
     def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
         """Check that the files of the certificate exist."""

@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import socket
-import stat
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ from ibrobot_ros2.services import plain
 
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import RunView, error_text
+from ibrobot_mcp.tokens import own_folder
 
 SERVICES = ("/agent/arm", "/agent/disarm", "/agent/status")
 _LARGEST = 64 * 1024
@@ -31,13 +31,7 @@ def sockets_folder() -> Path:
     """
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     folder = Path(runtime) / "ibrobot" if runtime else Path(tempfile.gettempdir()) / f"ibrobot-{os.getuid()}"
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    status = folder.lstat()
-    if stat.S_ISLNK(status.st_mode):
-        raise IbrobotError(f"{folder} is a link: remove it, or set XDG_RUNTIME_DIR")
-    if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
-        raise IbrobotError(f"{folder}: other users may enter it: chmod 700 {folder}, or set XDG_RUNTIME_DIR")
-    return folder
+    return own_folder(folder, "XDG_RUNTIME_DIR")
 
 
 class Persons:

@@ -14,6 +14,8 @@ import anyio.to_thread
 import attrs
 import mcp_types as types
 from mcp import MCPError
+from mcp.server.auth.middleware.bearer_auth import AuthenticatedUser
+from mcp.server.auth.provider import AccessToken
 from mcp.server.lowlevel.server import Server
 
 from ibrobot_core.api import IbrobotError
@@ -21,6 +23,7 @@ from ibrobot_core.app import SET_MODE, Agent, RequestError, RunView, error_text
 from ibrobot_mcp.audit import authority_of
 from ibrobot_mcp.prompts import PROMPTS, prompt
 from ibrobot_mcp.resources import Resources
+from ibrobot_mcp.tokens import agent_of
 from ibrobot_mcp.tools import Tools, refusal
 
 INSTRUCTIONS = """This is a robot. Call `state` first. You may look, plan and stop at any time. What moves the robot
@@ -34,8 +37,8 @@ _OPEN = 8
 """Calls of all agents that are carried out at the same time; others wait."""
 _WAITING = 32
 """Calls of an agent that may wait."""
-_AGENTS = 16
-"""Most agents that are connected; the one that has been silent for longest is disconnected for a new one."""
+_EACH = 4
+"""Most connections of an agent by HTTP; the one that has been silent for longest ends for a new one."""
 _START_S = 0.05
 _PING_S, _PONG_S = 0.5, 2.0
 """Interval of pings, and the longest wait for their answers [s]."""
@@ -46,6 +49,10 @@ class Client:
     """A connected client."""
 
     agent: Agent
+    name: str = ""
+    """Of the token of a client of HTTP; empty for one at pipes."""
+    token: str = ""
+    """The token; it may be taken away."""
     session: Any = None
     """Sends it requests, e.g. pings."""
     allowance: float = _BURST
@@ -72,7 +79,7 @@ class AgentServer:
         self._tools = Tools(run)
         self._resources = Resources(run)
         self._clients: dict[str, Client] = {}
-        """Session of the transport, empty where it has none -> the client."""
+        """What tells a client apart, see `key_of`, -> the client."""
         self._calls = anyio.CapacityLimiter(_OPEN)
         self._stops = anyio.CapacityLimiter(2)
         self.protocol: Server[Any] = Server(
@@ -95,6 +102,9 @@ class AgentServer:
         """
         while True:
             await asyncio.sleep(_PING_S)
+            for key, client in tuple(self._clients.items()):
+                if client.name and not await self._in_thread(agent_of, client.token):
+                    await self.leave(key)
             if self._authority.status().armed:
                 await asyncio.gather(*(self._ping(each) for each in tuple(self._clients.values())))
 
@@ -106,16 +116,20 @@ class AgentServer:
                 await client.session.send_ping()
             self._authority.renew(client.agent)
 
-    def leave(self, key: str = "") -> None:
+    async def leave(self, key: str) -> None:
         """Disconnect a client, whose authority ends."""
         client = self._clients.pop(key, None)
-        if client is not None:
-            self._authority.leave(client.agent)
+        if client is not None:  # control may let a motion's end wait
+            await self._in_thread(self._authority.leave, client.agent)
 
-    def close(self) -> None:
+    async def close(self) -> None:
         """Disconnect all clients."""
         for key in tuple(self._clients):
-            self.leave(key)
+            await self.leave(key)
+
+    async def _in_thread[*A, T](self, call: Callable[[*A], T], *arguments: *A) -> T:
+        """Call what may block, in a thread for what is urgent."""
+        return await anyio.to_thread.run_sync(call, *arguments, limiter=self._stops)
 
     async def _heard(self, ctx: Any, call_next: Callable[[Any], Awaitable[Any]]) -> Any:
         """Note a sign of life of a known client."""
@@ -127,26 +141,29 @@ class AgentServer:
             await asyncio.sleep(_START_S)
         return await call_next(ctx)
 
-    def _client(self, ctx: Any) -> Client:
+    async def _client(self, ctx: Any) -> Client:
         key = _key(ctx)
         if key not in self._clients:
-            if len(self._clients) >= _AGENTS:
-                self.leave(min(self._clients, key=lambda each: self._clients[each].agent.heard_ns))
+            caller = _caller(ctx)
             info = ctx.session.client_params
-            self._clients[key] = Client(
-                self._authority.join(info.client_info.name if info is not None else ""), counted_s=time.monotonic()
-            )
+            stated = info.client_info.name if info is not None else ""
+            name, token = (caller.client_id, caller.token) if caller is not None else ("", "")
+            agent = self._authority.join(name or stated)
+            self._clients[key] = Client(agent, name, token, counted_s=time.monotonic())
+            of_name = [other for other, each in self._clients.items() if name and each.name == name]
+            for other in sorted(of_name, key=lambda each: self._clients[each].agent.heard_ns)[: -_EACH or None]:
+                await self.leave(other)
         client = self._clients[key]
         client.session = ctx.session
         return client
 
     async def _list_tools(self, ctx: Any, params: Any) -> types.ListToolsResult:
-        self._client(ctx)
+        await self._client(ctx)
         tools = [tool.described(name) for name, tool in sorted(self._tools.all().items())]
         return types.ListToolsResult(tools=tools)
 
     async def _call_tool(self, ctx: Any, params: types.CallToolRequestParams) -> types.CallToolResult:
-        client = self._client(ctx)
+        client = await self._client(ctx)
         tools = self._tools.all()
         if (tool := tools.get(params.name)) is None:
             known = ", ".join(sorted(tools))
@@ -204,7 +221,7 @@ class AgentServer:
         return types.ListResourcesResult(resources=self._resources.all())
 
     async def _read_resource(self, ctx: Any, params: types.ReadResourceRequestParams) -> types.ReadResourceResult:
-        client = self._client(ctx)
+        client = await self._client(ctx)
         if busy := self._busy(client):
             raise MCPError(code=types.INTERNAL_ERROR, message=busy)
         try:
@@ -227,18 +244,25 @@ class AgentServer:
         return types.GetPromptResult(messages=[types.PromptMessage(role="user", content=content)])
 
 
+PIPES = "pipes"
+"""The key of the client at standard input and output."""
+
+
+def _caller(ctx: Any) -> AccessToken | None:
+    """The token that the client of a request has shown; None at pipes."""
+    user = None if ctx.request is None else ctx.request.scope["user"]
+    return user.access_token if isinstance(user, AuthenticatedUser) else None
+
+
 def _key(ctx: Any) -> str:
-    """What tells clients apart: the session of HTTP, without one the client's name; empty for standard input."""
-    if ctx.request is None:
-        return ""
-    if (session := ctx.request.headers.get("mcp-session-id", "")) or ctx.session.client_params is None:
-        return http_key(session)
-    return http_key(f"of {ctx.session.client_params.client_info.name}")
+    """What tells clients apart; nothing that a client says of itself does."""
+    caller = _caller(ctx)
+    return PIPES if caller is None else key_of(caller.client_id, ctx.request.headers.get("mcp-session-id", ""))
 
 
-def http_key(session: str) -> str:
-    """What tells a client of HTTP apart, none of which is that of standard input, whatever session it names."""
-    return f"http {session}"
+def key_of(name: str, session: str) -> str:
+    """The key of a client of HTTP: the agent whose token it has, and its session, which is empty where it has none."""
+    return f"http {name} {session}"
 
 
 def has_failed(answer: Any) -> bool:

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hmac
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
+import anyio
+import anyio.to_thread
 from aiohttp import web
 from ibrobot_http.guard import Guard
 from ibrobot_http.listener import Listener
 from ibrobot_http.server import HttpServer
+from mcp.server.auth.middleware.bearer_auth import AuthenticatedUser
+from mcp.server.auth.provider import AccessToken
 from mcp.server.streamable_http_manager import StreamableHTTPSessionManager
 
-from ibrobot_mcp.server import AgentServer, http_key
+from ibrobot_mcp.server import AgentServer, key_of
+from ibrobot_mcp.tokens import agent_of
 
 PATH = "/mcp"
 _LARGEST = 1024 * 1024
@@ -22,23 +26,30 @@ _LARGEST = 1024 * 1024
 _SESSIONS = 16
 _IDLE_S = 600.0
 """Time without a request after which a session ends [s]."""
-_NO_TOKEN = "this server needs the token that the run prints, as `Authorization: Bearer TOKEN`\n"
+_NO_TOKEN = "this server needs `Authorization: Bearer TOKEN`; `ibrobot agent add NAME` makes the token of an agent\n"
+_READS = 4
+"""Tokens that are looked up at the same time."""
 
 
 @contextlib.asynccontextmanager
-async def http_server(server: AgentServer, listener: Listener, token: str) -> AsyncIterator[None]:
+async def http_server(server: AgentServer, listener: Listener) -> AsyncIterator[None]:
     """Serve agents over HTTP until the block ends."""
     manager = StreamableHTTPSessionManager(
         server.protocol, session_idle_timeout=_IDLE_S, max_sessions=_SESSIONS, max_request_body_size=_LARGEST
     )
 
+    reads = anyio.CapacityLimiter(_READS)
+
     async def answer(request: web.Request) -> web.StreamResponse:
-        given = request.headers.get("Authorization", "").removeprefix("Bearer ")
-        if not hmac.compare_digest(given.encode(errors="replace"), token.encode()):
+        token = request.headers.get("Authorization", "").removeprefix("Bearer ")
+        name = await anyio.to_thread.run_sync(agent_of, token, limiter=reads)
+        if not name:
             return web.Response(status=401, text=_NO_TOKEN, headers={"WWW-Authenticate": "Bearer"})
-        response = await _asgi(manager.handle_request, request)
+        # The SDK lets nobody else use a session of this user.
+        user = AuthenticatedUser(AccessToken(token=token, client_id=name, scopes=[]))
+        response = await _asgi(manager.handle_request, request, user)
         if request.method == "DELETE":
-            server.leave(http_key(request.headers.get("mcp-session-id", "")))
+            await server.leave(key_of(name, request.headers.get("mcp-session-id", "")))
         return response
 
     app = web.Application(client_max_size=_LARGEST)
@@ -48,8 +59,10 @@ async def http_server(server: AgentServer, listener: Listener, token: str) -> As
         yield
 
 
-async def _asgi(app: Callable[[Any, Any, Any], Awaitable[None]], request: web.Request) -> web.StreamResponse:
-    """The answer of an ASGI application to a request."""
+async def _asgi(
+    app: Callable[[Any, Any, Any], Awaitable[None]], request: web.Request, user: AuthenticatedUser
+) -> web.StreamResponse:
+    """The answer of an ASGI application to a request of a user."""
     body = await request.read()
     scope = {
         "type": "http",
@@ -62,6 +75,7 @@ async def _asgi(app: Callable[[Any, Any, Any], Awaitable[None]], request: web.Re
         "root_path": "",
         "query_string": request.query_string.encode(),
         "headers": [(name.lower(), value) for name, value in request.raw_headers],
+        "user": user,
     }
     given = False
     response: web.StreamResponse | None = None

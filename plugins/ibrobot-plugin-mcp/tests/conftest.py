@@ -93,7 +93,7 @@ class Rig:
         return asyncio.run(connected())
 
     def close(self) -> None:
-        self.server.close()
+        asyncio.run(self.server.close())
         self.authority.close()
 
 

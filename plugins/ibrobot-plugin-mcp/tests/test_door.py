@@ -7,6 +7,7 @@ import contextlib
 import json
 import os
 import socket
+import stat
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,24 +16,23 @@ from typing import Any, cast, override
 
 import httpx2
 import pytest
-from ibrobot_mcp import ibrobot_commands, ibrobot_sections, stdio
+from ibrobot_mcp import audit, ibrobot_commands, ibrobot_sections, stdio
 from ibrobot_mcp.audit import authority_of
-from ibrobot_mcp.commands import ArmAgent, DisarmAgent, ShowAgents
+from ibrobot_mcp.commands import AddAgent, ArmAgent, DisarmAgent, ListAgents, RemoveAgent, ShowAgents
 from ibrobot_mcp.door import AgentDoor
 from ibrobot_mcp.options import McpOptions
 from ibrobot_mcp.persons import ask, running, sockets_folder
 from ibrobot_mcp.stdio import Pipes, serve_pipes
+from ibrobot_mcp.tokens import add_token, agent_of, remove_token
 from ibrobot_testing import SectionSuite, check_descriptor, make_session, stand_in
 from mcp import Client
 from mcp.client.streamable_http import streamable_http_client
 from mcp_types import Implementation
 
-from ibrobot_core.api import IbrobotError
+from ibrobot_core.api import HardwareError, IbrobotError
 from ibrobot_core.app import SET_MODE, Component, RequestError, Session
 
 from .conftest import Rig
-
-TOKEN = "0123456789abcdef-test"
 
 
 def session_with_control() -> Session:
@@ -52,6 +52,7 @@ def session_with_control() -> Session:
 def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "states"))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     return tmp_path
 
 
@@ -68,76 +69,220 @@ class TestAgentDoor(SectionSuite):
 def test_descriptor_is_complete() -> None:
     (descriptor,) = ibrobot_sections()
     check_descriptor(descriptor, McpOptions())
-    assert {each.name for each in ibrobot_commands()} == {"mcp", "agent", "agent arm", "agent disarm", "agent status"}
+    assert {each.name for each in ibrobot_commands()} == {"mcp", "agent"} | {
+        f"agent {verb}" for verb in ("add", "remove", "list", "arm", "disarm", "status")
+    }
 
 
 @pytest.fixture
 def door() -> Iterator[AgentDoor]:
-    made = AgentDoor(McpOptions(token=TOKEN), session_with_control())
+    made = AgentDoor(McpOptions(), session_with_control())
     made.start()
     yield made
     made.stop()
 
 
+@pytest.fixture
+def token() -> str:
+    return add_token("claude")
+
+
+def client(http: httpx2.AsyncClient, door: AgentDoor, mode: str, name: str = "mcp") -> Client:
+    """A client that says that it has a name."""
+    info = Implementation(name=name, version="1")
+    return Client(streamable_http_client(door.url, http_client=http), mode=mode, client_info=info)
+
+
+def bearer(token: str) -> httpx2.AsyncClient:
+    return httpx2.AsyncClient(headers={"Authorization": f"Bearer {token}"})
+
+
+OTHERS = [
+    "", ".", "claude", "claude.", "codex.{secret}", "claude.{secret}x", "CLAUDE.{secret}", "../claude.{secret}",
+    "claude\u0000.{secret}", "claude.{secret}\ud800", "claude/../claude.{secret}", "{secret}", "x" * 10_000,
+]  # fmt: skip
+"""Texts that are not the token `claude.{secret}`."""
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_no_other_text_is_a_token(token: str, other: str) -> None:
+    assert agent_of(token) == "claude"
+    assert agent_of(other.format(secret=token.partition(".")[2])) == ""
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "a.b", "../x", "a/b", "-x", "é", "a" * 41, "a\n"])
+def test_names_that_are_no_names_are_refused(name: str) -> None:
+    with pytest.raises(RequestError, match="a name has letters, digits"):
+        add_token(name)
+    with pytest.raises(RequestError, match="has no token; these have one: none"):
+        remove_token(name)
+
+
+def test_person_makes_names_and_takes_away_tokens(folders: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    add, known = AddAgent(name="claude"), ListAgents()
+    add.show(add())
+    token = capsys.readouterr().out.strip()
+    add_token("codex")
+    known.show(known())
+    assert capsys.readouterr().out == "claude\ncodex\n"
+    with pytest.raises(RequestError, match="agent claude has a token; `ibrobot agent remove claude` takes it away"):
+        AddAgent(name="claude")()
+    kept = folders / "config" / "ibrobot" / "agents"
+    assert stat.S_IMODE((kept / "claude").stat().st_mode) == 0o600
+    assert not any(token.partition(".")[2] in each.read_text() for each in kept.iterdir())
+    RemoveAgent(name="claude")()
+    assert agent_of(token) == ""
+    with pytest.raises(RequestError, match="agent 'claude' has no token; these have one: codex"):
+        RemoveAgent(name="claude")()
+    assert agent_of(add_token("claude")) == "claude"
+    assert agent_of(token) == "", "the old token stays taken away"
+
+
+@pytest.mark.parametrize("method", ["GET", "POST", "DELETE"])
 @pytest.mark.parametrize(
     ("headers", "status"),
     [
         ({}, 401),
-        ({"Authorization": "Bearer another-token-of-this-length"}, 401),
-        ({"Authorization": f"Bearer {TOKEN}", "Origin": "http://evil.example"}, 403),
-        ({"Authorization": f"Bearer {TOKEN}", "Host": "evil.example"}, 403),
-        ({"Authorization": f"Bearer {TOKEN}", "Sec-Fetch-Site": "cross-site"}, 403),
-        ({"Authorization": f"Bearer {TOKEN}"}, 406),
+        ({"Authorization": "Bearer claude.another-secret-of-this-length"}, 401),
+        ({"Authorization": "Bearer {token}", "Origin": "http://evil.example"}, 403),
+        ({"Authorization": "Bearer {token}", "Host": "evil.example"}, 403),
+        ({"Authorization": "Bearer {token}", "Sec-Fetch-Site": "cross-site"}, 403),
+        ({"Authorization": "Bearer {token}"}, 406),
     ],
 )
-@pytest.mark.parametrize("method", ["GET", "POST", "DELETE"])
-def test_http_needs_the_token_and_its_own_origin(
-    door: AgentDoor, method: str, headers: dict[str, str], status: int
+def test_http_needs_a_token_and_its_own_origin(
+    door: AgentDoor, token: str, method: str, headers: dict[str, str], status: int
 ) -> None:
-    answer = httpx2.request(method, door.url, headers=headers, timeout=30)
+    given = {name: value.format(token=token) for name, value in headers.items()}
+    answer = httpx2.request(method, door.url, headers=given, timeout=30)
     # A request that may enter is refused by the protocol for what it lacks.
     assert answer.status_code == status or (status == 406 and answer.status_code in (400, 404, 405, 406, 415))
 
 
 @pytest.mark.parametrize("mode", ["auto", "legacy"])
-def test_agent_over_http(door: AgentDoor, mode: str) -> None:
+def test_agent_over_http_is_named_by_its_token(door: AgentDoor, token: str, mode: str) -> None:
     async def talk() -> None:
+        async with bearer(token) as http, client(http, door, mode) as agent:
+            assert "state" in {each.name for each in (await agent.list_tools()).tools}
+            state = await agent.call_tool("state", {})
+            assert state.structured_content["authority"]["agents"] == ["1:claude"]
+
+    asyncio.run(talk())
+
+
+@pytest.mark.parametrize("hostile_mode", ["auto", "legacy"])
+@pytest.mark.parametrize("mode", ["auto", "legacy"])
+def test_agent_cannot_take_the_name_or_the_grant_of_another(
+    door: AgentDoor, token: str, mode: str, hostile_mode: str
+) -> None:
+    door.session.bus.serve(stand_in("/test/move"), lambda request: "moves")
+    other = add_token("hostile")
+
+    async def talk() -> Any:
+        async with bearer(token) as http, client(http, door, mode) as armed:
+            await armed.list_tools()
+            ask(next(running()), "/agent/arm", {"seconds": 60, "services": ["/test/move"]})
+            async with bearer(other) as bad, client(bad, door, hostile_mode, name="claude") as hostile:
+                stolen = await hostile.call_tool("test_move", {})
+                status = (await hostile.call_tool("state", {})).structured_content["authority"]
+            return stolen, status, await armed.call_tool("test_move", {})
+
+    stolen, status, own = asyncio.run(talk())
+    assert stolen.is_error
+    assert "2:hostile may not move the robot" in stolen.content[0].text
+    assert (status["agents"], status["armed"]) == (["1:claude", "2:hostile"], "1:claude")
+    assert own.structured_content == {"answer": "moves"}
+
+
+def test_session_of_another_agent_is_of_no_use(door: AgentDoor, token: str) -> None:
+    """Somebody who has read the session's number, and has a token of his own."""
+    other = add_token("hostile")
+    sessions: list[str] = []
+
+    async def note(response: httpx2.Response) -> None:
+        sessions.extend(filter(None, [response.headers.get("mcp-session-id")]))
+
+    async def talk() -> None:
+        headers = {"Authorization": f"Bearer {token}"}
         async with (
-            httpx2.AsyncClient(headers={"Authorization": f"Bearer {TOKEN}"}) as http,
-            Client(streamable_http_client(door.url, http_client=http), mode=mode) as client,
+            httpx2.AsyncClient(headers=headers, event_hooks={"response": [note]}) as http,
+            client(http, door, "legacy") as armed,
         ):
-            assert "state" in {each.name for each in (await client.list_tools()).tools}
-            state = await client.call_tool("state", {})
-            assert state.structured_content["authority"]["agents"] == ["1:mcp"]
+            await armed.list_tools()
+            ask(next(running()), "/agent/arm", {"seconds": 60, "services": ["/test/move"]})
+            stolen = {"Authorization": f"Bearer {other}", "mcp-session-id": sessions[0]}
+            call = {"jsonrpc": "2.0", "id": 9, "method": "tools/call", "params": {"name": "state", "arguments": {}}}
+            more = {"Accept": "application/json, text/event-stream"}
+            async with httpx2.AsyncClient(headers={**stolen, **more}) as hostile:
+                for answer in (
+                    await hostile.post(door.url, json=call),
+                    await hostile.delete(door.url),
+                    await hostile.get(door.url),
+                ):
+                    assert answer.status_code == 404
+            state = await armed.call_tool("state", {})
+            assert state.structured_content["authority"]["armed"] == "1:claude"
 
     asyncio.run(talk())
 
 
 @pytest.mark.parametrize("mode", ["auto", "legacy"])
-def test_agents_of_two_programs_over_http_are_two(door: AgentDoor, mode: str) -> None:
-    async def talk(name: str) -> Any:
-        async with (
-            httpx2.AsyncClient(headers={"Authorization": f"Bearer {TOKEN}"}) as http,
-            Client(
-                streamable_http_client(door.url, http_client=http),
-                mode=mode,
-                client_info=Implementation(name=name, version="1"),
-            ) as client,
-        ):
-            await client.list_tools()
-            return (await client.call_tool("state", {})).structured_content["authority"]["agents"]
+def test_agent_whose_token_is_taken_away_is_disconnected_and_its_authority_ends(
+    door: AgentDoor, token: str, mode: str
+) -> None:
+    authority = authority_of(door.session)
 
-    async def both() -> Any:
-        await talk("first")
-        return await talk("second")
+    async def talk() -> None:
+        async with bearer(token) as http, client(http, door, mode) as armed:
+            await armed.list_tools()
+            ask(next(running()), "/agent/arm", {"seconds": 60, "services": ["/test/move"], "lease": 100})
+            remove_token("claude")
+            while authority.status().agents:
+                await asyncio.sleep(0.01)
+            assert authority.status().ended == "the agent is gone"
+            answer = await http.post(door.url, json={})
+            assert answer.status_code == 401
 
-    assert "2:second" in asyncio.run(both())
+    asyncio.run(talk())
 
 
-def test_large_request_is_refused(door: AgentDoor) -> None:
+def test_agent_has_a_few_connections_and_those_of_others_stay(door: AgentDoor, token: str) -> None:
+    other = add_token("hostile")
+    authority = authority_of(door.session)
+
+    async def talk() -> None:
+        async with bearer(token) as http, client(http, door, "legacy") as armed:
+            await armed.list_tools()
+            for _ in range(6):
+                async with bearer(other) as bad, client(bad, door, "legacy") as hostile:
+                    await hostile.list_tools()
+            names = [each.partition(":")[2] for each in authority.status().agents]
+            assert names.count("claude") == 1
+            assert names.count("hostile") <= 4
+
+    asyncio.run(talk())
+
+
+def test_tokens_are_in_no_log(door: AgentDoor, token: str, caplog: pytest.LogCaptureFixture, folders: Path) -> None:
+    async def talk() -> None:
+        async with bearer(token) as http, client(http, door, "legacy") as agent:
+            await agent.list_tools()
+            await agent.call_tool("nothing", {"a": 1})
+        async with bearer(f"{token}x") as http:
+            await http.post(door.url, json={})
+
+    with caplog.at_level("DEBUG"):
+        asyncio.run(talk())
+    door.stop()
+    secret = token.partition(".")[2]
+    assert secret not in caplog.text
+    assert not any(secret in each.read_text() for each in folders.rglob("*.jsonl"))
+
+
+def test_large_request_is_refused(door: AgentDoor, token: str) -> None:
     with contextlib.suppress(httpx2.TransportError):  # it may close the connection before all of it was sent
         answer = httpx2.post(
-            door.url, content=b"[" * 2_000_000, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=30
+            door.url, content=b"[" * 2_000_000, headers={"Authorization": f"Bearer {token}"}, timeout=30
         )
         assert answer.status_code == 413
 
@@ -344,7 +489,7 @@ def test_log_is_a_line_for_each_event(door: AgentDoor, folders: Path) -> None:
     agent = authority_of(door.session).join('x"\n{"event": "forged"}')
     with pytest.raises(IbrobotError):
         authority_of(door.session).call(agent, "/nothing", {"a": "\n"})
-    door.step(0)
+    door.stop()
     (path,) = (folders / "states" / "ibrobot" / "agents").iterdir()
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     assert [each["event"] for each in lines] == ["joined", "refused"]
@@ -352,11 +497,91 @@ def test_log_is_a_line_for_each_event(door: AgentDoor, folders: Path) -> None:
     assert {each["robot"] for each in lines} == {"tester"}
 
 
+def log_file(folders: Path) -> Path:
+    path = folders / "states" / "ibrobot" / "agents" / "tester.jsonl"
+    path.parent.mkdir(parents=True)
+    return path
+
+
+def test_full_disk_ends_the_authority_and_loses_nothing_in_silence(
+    folders: Path, token: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(audit, "_AGAIN_S", 0.001)
+    path = log_file(folders)
+    path.symlink_to("/dev/full")
+    door = AgentDoor(McpOptions(), session_with_control())
+    door.start()
+    authority = authority_of(door.session)
+    authority.join("claude")
+    while not door._audit.trouble:
+        threading.Event().wait(0.001)
+    grant = {"seconds": 60, "services": ["/test/move"]}
+    with pytest.raises(HardwareError, match=r"cannot be written: .*No space left on device; nothing was granted"):
+        door.session.bus.call("/agent/arm", grant)
+    assert authority.status().armed == ""
+    path.unlink()  # there is space again; the file is opened only once
+    door.stop()
+    assert "3 entries of the log of agents were not written" in caplog.text
+    assert caplog.text.count("no agent has authority until it can") == 1
+
+
+class SlowDisk:
+    """A file that takes nothing before it is `drained`."""
+
+    def __init__(self, path: Path) -> None:
+        os.mkfifo(path)
+        self._end = os.open(path, os.O_RDWR | os.O_NONBLOCK)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                os.write(self._end, b"." * 4096)
+
+    def drained(self, events: int) -> list[str]:
+        """The events that are written from now on, once there are so many."""
+        os.set_blocking(self._end, True)
+        text = b""
+        while text.count(b"\n") < events:
+            text += os.read(self._end, 65536)
+        return [json.loads(line)["event"] for line in text.lstrip(b".").splitlines()]
+
+    def close(self) -> None:
+        os.close(self._end)
+
+
+def test_slow_disk_delays_no_end_of_an_authority_and_loses_nothing(
+    folders: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = SlowDisk(log_file(folders))
+    door = AgentDoor(McpOptions(http=False), session_with_control())
+    door.start()
+    authority = authority_of(door.session)
+    agent = authority.join("claude")
+    door.session.bus.call("/agent/arm", {"seconds": 60, "services": ["/test/move"]})
+    door.step(0)
+    assert authority.status().armed == "1:claude"
+    monkeypatch.setattr(audit, "LATE_S", 0.0)
+    door.step(0)
+    assert "has not been written for 0 s" in authority.status().ended
+    monkeypatch.setattr(audit, "LATE_S", 60.0)
+    authority.leave(agent)
+    assert disk.drained(4) == ["joined", "armed", "ended", "left"]
+    door.stop()
+    disk.close()
+
+
+def test_line_that_a_full_disk_has_torn_stays_alone(door: AgentDoor, folders: Path) -> None:
+    path = log_file(folders)
+    path.write_text('{"event": "cal')
+    authority_of(door.session).join("claude")
+    door.stop()
+    torn, whole = path.read_text().splitlines()
+    assert torn == '{"event": "cal'
+    assert json.loads(whole)["event"] == "joined"
+
+
 @pytest.mark.parametrize(
     ("options", "why"),
     [
         ({"host": "0.0.0.0"}, "can be reached from the network, which needs TLS"),
-        ({"token": "short"}, "token must have at least 16 characters"),
         ({"certificate": Path("x")}, "certificate and key belong together"),
         ({"port": 70_000}, "must be at most 65535"),
     ],

@@ -9,8 +9,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from ibrobot_mcp.server import has_failed, http_key
+from ibrobot_mcp.server import PIPES, has_failed, key_of
 from mcp import Client, MCPError
+from mcp.server.auth.middleware.bearer_auth import AuthenticatedUser
+from mcp.server.auth.provider import AccessToken
 
 from .conftest import STATE, Rig
 
@@ -204,34 +206,59 @@ def test_calls_that_an_agent_cancels_keep_their_threads_until_they_are_done(rig:
     assert rig.moves == ["stop"]
 
 
-@pytest.mark.parametrize("session", ["", " ", "http", "x"])
-def test_client_of_http_is_never_that_of_the_pipes(rig: Rig, session: str) -> None:
-    class Piped:
-        session = SimpleNamespace(client_params=None)
-        request: Any = None
-
-    class Web(Piped):
-        request = SimpleNamespace(headers={"mcp-session-id": session})
-
-    assert rig.server._client(Piped()).agent is not rig.server._client(Web()).agent
-    rig.server.leave(http_key(session))
-    assert rig.authority.status().agents == ("1:agent",)
+def asked(name: str = "", session: str = "") -> Any:
+    """The context of a request: by HTTP with the token of `name`, or by the pipes."""
+    known = SimpleNamespace(client_params=None)
+    if not name:
+        return SimpleNamespace(session=known, request=None)
+    user = AuthenticatedUser(AccessToken(token=f"{name}.secret", client_id=name, scopes=[]))
+    headers = {"mcp-session-id": session}
+    return SimpleNamespace(session=known, request=SimpleNamespace(headers=headers, scope={"user": user}))
 
 
-def test_most_agents_are_bounded(rig: Rig) -> None:
-    class Session:
-        client_params = None
+@pytest.mark.parametrize("session", ["", " ", "http", "x", PIPES])
+@pytest.mark.parametrize("name", [PIPES, "http", "agent"])
+def test_client_of_http_is_never_that_of_the_pipes(rig: Rig, name: str, session: str) -> None:
+    async def both() -> None:
+        piped, web = await rig.server._client(asked()), await rig.server._client(asked(name, session))
+        assert piped.agent is not web.agent
+        await rig.server.leave(key_of(name, session))
+        assert rig.authority.status().agents == ("1:agent",)
 
-    class Request:
-        def __init__(self, key: str) -> None:
-            self.headers = {"mcp-session-id": key}
+    asyncio.run(both())
 
-    class Context:
-        session = Session()
 
-        def __init__(self, key: str) -> None:
-            self.request = Request(key)
+def test_connections_of_an_agent_are_bounded_and_the_silent_one_ends(rig: Rig) -> None:
+    async def connect() -> None:
+        for number in range(10):
+            await rig.server._client(asked("claude", f"s{number}"))
+        await rig.server._client(asked("codex", "s0"))
 
-    for number in range(100):
-        rig.server._client(Context(f"session {number}"))
-    assert len(rig.server._clients) == len(rig.authority.status().agents) == 16
+    asyncio.run(connect())
+    names = [each.partition(":")[2] for each in rig.authority.status().agents]
+    assert names == ["claude"] * 4 + ["codex"]
+
+
+@MODES
+def test_agent_that_leaves_blocks_nobody(rig: Rig, mode: str) -> None:
+    """Control may let the end of a motion wait."""
+    ended, answers = threading.Event(), []
+
+    def hold(*command: Any, **more: Any) -> dict[str, Any]:
+        ended.wait(10)
+        return {}
+
+    async def talk(client: Client) -> None:
+        await client.list_tools()
+        rig.grant()
+        rig.session.control.call = hold  # type: ignore[method-assign]
+        leaving = asyncio.create_task(rig.server.leave(PIPES))
+        await asyncio.sleep(0)
+        answers.append(await client.list_tools())
+        assert not leaving.done()
+        ended.set()
+        await leaving
+
+    rig.talk(talk, mode)
+    assert answers
+    assert rig.authority.status().armed == ""
