@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import enum
 import json
 import threading
 import time
@@ -76,6 +77,17 @@ class Wait:
 type Content = list[types.ContentBlock]
 
 
+class Way(enum.Enum):
+    """How a call is carried out."""
+
+    URGENT = enum.auto()
+    """At once, beside all others."""
+    READS = enum.auto()
+    """Behind other calls of the agent that read, and where others leave the processor time."""
+    ACTS = enum.auto()
+    """Beside others; it may wait, and hold nobody up."""
+
+
 @attrs.frozen(eq=False)
 class RobotTool:
     """A tool of the agent."""
@@ -84,7 +96,12 @@ class RobotTool:
     """What declares its arguments."""
     run: Callable[[Agent, Any], tuple[Content, Any]]
     """Agent and arguments -> what the agent is shown, and the same as plain data."""
-    urgent: bool = False
+    way: Way = Way.ACTS
+
+    @property
+    def urgent(self) -> bool:
+        """Whether it must not wait behind others."""
+        return self.way is Way.URGENT
 
     def described(self, name: str) -> types.Tool:
         """Its description for agents."""
@@ -124,7 +141,7 @@ class Tools:
     def all(self) -> dict[str, RobotTool]:
         """The tools in the robot's present mode, by name."""
         served = {
-            tool_name(name): RobotTool(service, self._caller(service), urgent=service.urgent)
+            tool_name(name): RobotTool(service, self._caller(service), _way(service))
             for name, service in self._session.bus.services().items()
             if not service.persons and name not in _LEFT_OUT
         }
@@ -217,6 +234,12 @@ class Tools:
             content.append(types.TextContent(text=json.dumps(_described(sight))))
             content.append(types.ImageContent(data=base64.b64encode(sight.data).decode(), mime_type=sight.kind))
         return content, {"pictures": [_described(each) for each in sights]}
+
+
+def _way(service: Service[Any, Any]) -> Way:
+    if service.urgent:
+        return Way.URGENT
+    return Way.READS if service.reads else Way.ACTS
 
 
 def tool_name(service: str) -> str:

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
+import os
+import sys
 import threading
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,7 +18,7 @@ from mcp import Client, MCPError
 from mcp.server.auth.middleware.bearer_auth import AuthenticatedUser
 from mcp.server.auth.provider import AccessToken
 
-from .conftest import STATE, Rig
+from .conftest import STATE, STOP, Rig
 
 MODES = pytest.mark.parametrize("mode", ["auto", "legacy"])
 
@@ -123,6 +127,94 @@ def test_agent_that_calls_too_often_is_refused_and_may_still_stop(rig: Rig, monk
 
     rig.talk(act)
     assert rig.moves == ["stop"]
+
+
+def test_agent_that_computes_much_is_refused_until_its_share_has_grown(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s, used_s = [100.0], itertools.count(0.0, 6.0)  # each call takes 6 s of a processor
+    monkeypatch.setattr("ibrobot_mcp.server.time.monotonic", lambda: now_s[0])
+    monkeypatch.setattr("ibrobot_mcp.server.time.thread_time", lambda: next(used_s))
+
+    async def act(client: Client) -> None:
+        assert not (await client.call_tool("test_state", {})).is_error
+        refused = await client.call_tool("test_state", {})
+        assert text(refused) == "your calls have used more than 25% of a processor: call again in 4.0 s"
+        for _ in range(9):
+            assert not (await client.call_tool("stop", {})).is_error
+        now_s[0] += 4.1 + 9 * 24.0  # stops are never refused, and count
+        assert not (await client.call_tool("test_state", {})).is_error
+
+    rig.talk(act)
+    assert rig.moves == ["stop"] * 9
+
+
+class Slow:
+    """A service that reads, and waits at each call until it may go on."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.may_go_on = threading.Semaphore(0)
+        self.under_way = self.most = 0
+        self.begun = threading.Semaphore(0)
+        self._lock = threading.Lock()
+        rig.session.bus.unserve(STATE)
+        rig.session.bus.serve(STATE, self.read)
+
+    def read(self, request: Any) -> float:
+        with self._lock:
+            self.under_way += 1
+            self.most = max(self.most, self.under_way)
+        self.begun.release()
+        self.may_go_on.acquire()
+        self.under_way -= 1
+        return 0.5
+
+
+def test_reading_of_an_agent_is_one_after_the_other_and_holds_nobody_else_up(rig: Rig) -> None:
+    slow = Slow(rig)
+
+    async def connected(name: str) -> Any:
+        return await rig.server._client(asked(name))
+
+    async def both() -> None:
+        tool = rig.server._tools.all()["test_state"]
+        first, second = await connected("first"), await connected("second")
+
+        def call(client: Any) -> asyncio.Task[Any]:
+            run = partial(tool.run, client.agent, {})
+            return asyncio.create_task(rig.server._carried_out(client, run, tool.way))
+
+        calls = [call(first) for _ in range(5)]
+        await asyncio.to_thread(slow.begun.acquire)
+        calls.append(call(second))
+        await asyncio.to_thread(slow.begun.acquire)
+        assert slow.under_way == 2
+        slow.may_go_on.release(6)
+        await asyncio.gather(*calls)
+        assert slow.most == 2
+
+    asyncio.run(both())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has priorities of threads")
+def test_threads_that_read_leave_the_processor_to_others_and_stops_do_not(rig: Rig) -> None:
+    nice: dict[str, int] = {}
+
+    def note(name: str, answer: Any) -> Any:
+        nice[name] = os.getpriority(os.PRIO_PROCESS, 0)
+        return answer
+
+    for service, answer in ((STATE, 0.5), (STOP, None)):
+        rig.session.bus.unserve(service)
+        rig.session.bus.serve(service, lambda request, name=service.name, answer=answer: note(name, answer))
+
+    async def act(client: Client) -> None:
+        await client.call_tool("test_state", {})
+        await client.call_tool("stop", {})
+
+    rig.talk(act)
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    assert nice == {STATE.name: min(own + 10, 19), STOP.name: own}
 
 
 def test_service_with_a_bug_is_reported_and_ends_nothing(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:

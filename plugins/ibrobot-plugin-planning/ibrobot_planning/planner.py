@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Literal
 
 import attrs
@@ -97,6 +97,8 @@ class PlanRequest:
     """Fraction of the acceleration limits, in (0, 1]."""
     others: Mapping[str, float] = attrs.field(factory=dict)
     """Positions [rad] of joints that do not move, e.g. the gripper; omitted joints are assumed to be at 0."""
+    check_wanted: Callable[[], None] = lambda: None
+    """Raises a PlanningError once nobody wants the plan any more. Planners that search call it often."""
 
 
 @attrs.frozen(eq=False)

@@ -31,6 +31,9 @@ from ibrobot_planning.planner import AnyGoal, Goal, JointGoal, Planner, PlannerD
 from ibrobot_planning.planners.completion import Start, check_size, completed
 from ibrobot_planning.world.objects import World, world_of
 
+_GLANCE_S = 0.02
+"""Interval at which a request that waits for the planner looks whether it is still wanted [s]."""
+
 
 class GoalPlans:
     """Plans goals for the executors of a mode.
@@ -50,6 +53,10 @@ class GoalPlans:
         self._mode = mode
         self._lock = threading.Lock()
         """Held while the planner plans."""
+        self.era = 0
+        """How often `drop` was called: plans for goals of earlier eras are not wanted any more."""
+        self._moves = False
+        """Whether a plan for a motion is made, or waits for the planner."""
 
     def make(self) -> Planner:
         """Make the planner, without loading it."""
@@ -145,12 +152,19 @@ class GoalPlans:
             raise invalid_goal(f"goal {target.text!r}: {both} moves the tool, and cannot be given beside its position")
         return {arms[0]: target.tool, **parts}
 
-    def plan(self, target: Target, start: Vector) -> tuple[dict[str, ExecutorGoal], PlanResult | None]:
+    def drop(self) -> None:
+        """End every search under way, and every wait for the planner, with the code PREEMPTED."""
+        self.era += 1
+
+    def plan(
+        self, target: Target, start: Vector, *, era: int | None = None
+    ) -> tuple[dict[str, ExecutorGoal], PlanResult | None]:
         """Plan a goal.
 
         Args:
             target: the goal.
             start: positions of all joints [rad], shape (J,), from which the motion begins.
+            era: the era in which a motion to the goal was wanted; None: nothing is to move.
 
         Returns:
             Executor -> its goal, and the plan; None if nothing had to be planned.
@@ -175,7 +189,7 @@ class GoalPlans:
             else:
                 joints = self._session.config.executors[name].joints
                 first, scalings = start[robot.indices(joints)], (target.velocity_scaling, target.acceleration_scaling)
-                planned = self.planned(PlanRequest(joints, first, goal, *scalings, others))
+                planned = self.planned(PlanRequest(joints, first, goal, *scalings, others), era=era)
                 trajectory = planned.trajectory
             goals[name] = FollowTrajectory(self._checked(trajectory, start, others))
         return goals, planned
@@ -196,23 +210,55 @@ class GoalPlans:
             raise PlanningError(f"the trajectory is not free: {touched}", PlanCode.INVALID_MOTION_PLAN)
         return whole
 
-    def planned(self, request: PlanRequest) -> PlanResult:
-        """Plan by the mode's planner, one request at a time.
+    def planned(self, request: PlanRequest, *, era: int | None = None) -> PlanResult:
+        """Plan by the mode's planner, one request at a time; what is to move comes before what is not.
+
+        Args:
+            request: the request.
+            era: as for `plan`.
 
         Raises:
-            PlanningError: with MoveIt's code.
+            PlanningError: with MoveIt's code; PREEMPTED after `drop`, and if a plan for a motion takes its place.
         """
+        moves, era = era is not None, self.era if era is None else era
+
+        def check_wanted() -> None:
+            if self.era != era:
+                raise PlanningError("cancelled", PlanCode.PREEMPTED)
+            if self._moves and not moves:
+                raise PlanningError("the planner plans a motion instead: ask again", PlanCode.PREEMPTED)
+
         goal = without_names(request.goal, self._session.config.robot, request.joints)
         speed = min(request.velocity_scaling, self._session.authority.speed)
-        with self._lock:
-            try:
-                return self.planner.plan(attrs.evolve(request, goal=goal, velocity_scaling=speed))
-            except IbrobotError:
-                raise
-            except Exception as error:
-                # A planner's bug must not end the run of a robot.
-                self._session.log.exception("a bug of planner %s; please report it", type(self.planner).__name__)
-                raise PlanningError(f"the planner failed: {type(error).__name__}: {error}", PlanCode.FAILURE) from error
+        request = attrs.evolve(request, goal=goal, velocity_scaling=speed, check_wanted=check_wanted)
+        if not moves:
+            return self._plan(request)
+        self._moves = True  # only the thread that moves the robot comes here
+        try:
+            return self._plan(request)
+        finally:
+            self._moves = False
+
+    def _plan(self, request: PlanRequest) -> PlanResult:
+        request.check_wanted()
+        while not self._lock.acquire(timeout=_GLANCE_S):
+            request.check_wanted()
+        try:
+            plan = self._plan_alone(request)
+        finally:
+            self._lock.release()
+        request.check_wanted()
+        return plan
+
+    def _plan_alone(self, request: PlanRequest) -> PlanResult:
+        try:
+            return self.planner.plan(request)
+        except IbrobotError:
+            raise
+        except Exception as error:
+            # A planner's bug must not end the run of a robot.
+            self._session.log.exception("a bug of planner %s; please report it", type(self.planner).__name__)
+            raise PlanningError(f"the planner failed: {type(error).__name__}: {error}", PlanCode.FAILURE) from error
 
 
 def tool_planners(registry: Plugins) -> list[str]:

@@ -116,6 +116,8 @@ class _Move:
     """Whether the run was started with this goal; it ends after all such goals."""
     stops: int = 0
     """Number of emergency stops before it was requested."""
+    era: int = 0
+    """The era of plans in which it was requested."""
     failures: list[str] = attrs.field(factory=list)
     begun_ns: int | None = None
     planned: PlanResult | None = None
@@ -154,6 +156,8 @@ class PlannerSource(SourceWorker):
         self._status = ""
         self._status_ns = 0
         self._worker = 0
+        self._submitting = threading.Lock()
+        """Held while a goal is handed over, so that the last one is of the newest era."""
         self._choosing = threading.Lock()
         """Held while the move under way changes."""
         self._unwatched = threading.Event()
@@ -173,7 +177,7 @@ class PlannerSource(SourceWorker):
         self._services: dict[Service[Any, Any], Callable[[Any], Any]] = {
             GO_TO: lambda request: self._submit(request.goal).number,
             RESULT: lambda request: self._results.of(request.number),
-            CANCEL: lambda _: self._inbox.put(None),
+            CANCEL: lambda _: self._put(None),
             MOVE_ACTION: self._move_action,
             EXECUTE: self._execute,
             MOVE_TO_POSE: self._move_to_pose,
@@ -303,13 +307,21 @@ class PlannerSource(SourceWorker):
         self._plans.check(parsed)
         if self.session.faults:
             raise PlanningError(f"refused before a reset: {self.session.faults[-1]}", PlanCode.CONTROL_FAILED)
-        return _Move(self._results.number(), parsed, asked, stops)
+        return _Move(self._results.number(), parsed, asked, stops, self._plans.era)
 
     def _submit(self, goal: str | Goal | Target, velocity_scaling: float = 1.0) -> _Move:
         """Replace all goals by this one."""
         move = self._new(goal, velocity_scaling)
-        self._inbox.put(move)
+        self._put(move)
         return move
+
+    def _put(self, move: _Move | None) -> None:
+        """Have a goal replace all others, or none if it is None; a search for one of them ends at once."""
+        with self._submitting:
+            self._plans.drop()
+            if move is not None:
+                move.era = self._plans.era
+            self._inbox.put(move)
 
     def _move_action(self, wanted: MoveRequest) -> int:
         goal = self._plans.any_goal(wanted.goals, commanded(self.session))
@@ -413,10 +425,10 @@ class PlannerSource(SourceWorker):
         new.begun_ns = self.session.clock.now_ns()
         self._show("executing")
         try:
-            goals, new.planned = self._plans.plan(new.target, rest)
+            goals, new.planned = self._plans.plan(new.target, rest, era=new.era)
         except PlanningError as error:
             self._execution.stop(new.number)
-            self._finish(new, "PLANNING_FAILED", error.code, str(error))
+            self._finish(new, _outcome(error), error.code, str(error))
             return True
         if not new.blocked:
             self._following(new, lambda: self._execution.follow(goals))
@@ -472,12 +484,12 @@ class PlannerSource(SourceWorker):
         move.begun_ns = self.session.clock.now_ns()
         self._show("executing")
         try:
-            goals, move.planned = self._plans.plan(move.target, commanded(self.session))
+            goals, move.planned = self._plans.plan(move.target, commanded(self.session), era=move.era)
             with self._choosing:
                 self._move = move
             self._execution.begin(move.number, goals, move.stops)
         except PlanningError as error:
-            self._finish(move, "PLANNING_FAILED", error.code, str(error))
+            self._finish(move, _outcome(error), error.code, str(error))
         except HardwareError as error:
             self._finish(move, "EXECUTION_FAILED", PlanCode.CONTROL_FAILED, str(error))
 
@@ -552,6 +564,11 @@ class PlannerSource(SourceWorker):
         """End all goals and the waiting of their callers."""
         self.end()
         self._over = True
+
+
+def _outcome(error: PlanningError) -> Outcome:
+    """How a goal ends for which there is no plan."""
+    return "CANCELLED" if error.code is PlanCode.PREEMPTED else "PLANNING_FAILED"
 
 
 def _replaced(move: _Move | None) -> str:

@@ -87,6 +87,7 @@ class RrtConnectPlanner(Planner):
         start = self._check_start(request)
         world = self._paths.snapshot(self._options)
         checks = collisions(self.arm, world, request.joints, request.others, self._options)
+        checks.before = request.check_wanted  # whatever takes time in a search checks for contacts
         deadline = begun + self._options.planning_time
         assert self._tool is not None
         result = _Plan(self._ctx, self._options, self._tool, request, start, checks, deadline).solve()
@@ -139,6 +140,8 @@ class _Plan:
                 share = (self.deadline - time.monotonic()) / (len(alternatives) - number)
                 return self._reach(alternative, number, way_out, time.monotonic() + share)
             except PlanningError as failure:
+                if failure.code is PlanCode.PREEMPTED:
+                    raise
                 failures.append(failure)
         if len(failures) == 1:
             raise failures[0]

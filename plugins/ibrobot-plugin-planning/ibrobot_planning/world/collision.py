@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -93,6 +93,8 @@ class Collisions:
         self._exact = engine(arm.shapes)
         self._coarse = engine(arm.hulls) if arm.hulls else self._exact
         """Contains everything that `_exact` has, in fewer shapes."""
+        self.before: Callable[[], None] = lambda: None
+        """Called before lines, paths and lists of configurations are checked; what it raises ends the check."""
 
     @property
     def geometry(self) -> Any:
@@ -155,6 +157,7 @@ class Collisions:
             b: the end.
             resolution: maximum motion of any point of the arm between two checks [m].
         """
+        self.before()
         begin, way = self._still.copy(), np.zeros(len(self._still))
         begin[self._columns] = a - self._reference
         way[self._columns] = b - a
@@ -199,6 +202,7 @@ class Collisions:
 
     def native(self, configurations: Vector) -> Vector:
         """Configurations of the planned joints, shape (N, J), completed with all other joints for Pinocchio."""
+        self.before()
         whole = np.empty((len(configurations), len(self._still)))
         whole[:] = self._still
         whole[:, self._columns] = configurations - self._reference
