@@ -344,9 +344,13 @@ def test_scripted_agent_does_ten_tasks_of_increasing_length(tmp_path: Path, mode
 def test_agents_read_the_robot_without_its_secrets(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AGENT_TOKEN", "hunter2-hunter2-hunter2")
     config = load_config(
-        CONFIGS / "so101_blind.yaml", sim=True, overrides=("web.password=${AGENT_TOKEN}",), registry=installed_plugins()
+        CONFIGS / "so101_blind.yaml",
+        sim=True,
+        overrides=("viewer={type: web, password: '${AGENT_TOKEN}'}",),
+        registry=installed_plugins(),
     )
-    assert config.plugin_sections["web"].options.password == "hunter2-hunter2-hunter2"
+    assert config.viewer is not None
+    assert config.viewer.options.password == "hunter2-hunter2-hunter2"
     text = Resources(Session(config, installed_plugins(), LaunchRequest(lockstep=True))).read("ibrobot://robot")[1]
     assert "hunter2" not in text
     assert "shoulder_pan" in text

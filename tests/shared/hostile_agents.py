@@ -318,7 +318,7 @@ def memory_mb() -> float:
 def attacked(calls: int, seed: int = 0, on_part: Callable[[float], object] = lambda mb: None) -> HostileRun:
     """A run after hostile calls, in ten parts; `on_part` is called with the memory after each [MB]."""
     agent_tools._MOST_S = 0.0  # a call does not wait: time passes between calls
-    agent_server._PER_SECOND = agent_server._BURST = 1e9  # so that each call is looked at
+    agent_server._PER_SECOND = agent_server._SHARE = 1e9  # so that each call is looked at
     run = HostileRun(seed)
     run.start()
 

@@ -200,13 +200,13 @@ def test_reading_of_an_agent_is_one_after_the_other_and_holds_nobody_else_up(rig
 def test_threads_that_read_leave_the_processor_to_others_and_stops_do_not(rig: Rig) -> None:
     nice: dict[str, int] = {}
 
-    def note(name: str, answer: Any) -> Any:
+    def note(name: str, answer: Any, request: Any) -> Any:
         nice[name] = os.getpriority(os.PRIO_PROCESS, 0)
         return answer
 
     for service, answer in ((STATE, 0.5), (STOP, None)):
         rig.session.bus.unserve(service)
-        rig.session.bus.serve(service, lambda request, name=service.name, answer=answer: note(name, answer))
+        rig.session.bus.serve(service, partial(note, service.name, answer))
 
     async def act(client: Client) -> None:
         await client.call_tool("test_state", {})
