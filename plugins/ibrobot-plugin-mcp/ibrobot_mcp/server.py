@@ -41,7 +41,7 @@ _SHARE, _AT_ONCE_S = 0.25, 5.0
 """Share of a processor that the calls of an agent may use, on average, and its time at once [s]."""
 _OPEN = 8
 """Calls of all agents that are carried out at the same time; others wait."""
-_READING, _NICE = 4, 10
+_READING, _NICE = 2, 10
 """Threads for services that read, e.g. plan: one for an agent at a time; and their niceness."""
 _WAITING = 32
 """Calls of an agent that may wait."""

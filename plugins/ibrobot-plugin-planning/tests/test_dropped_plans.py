@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import pytest
+from ibrobot_planning.execution.results import MoveResult
 from ibrobot_planning.execution.source import CANCEL, GO_TO, RESULT, PlannerSource
-from ibrobot_planning.planner import AnyGoal, JointGoal, LinearGoal, PlanRequest, PlanResult, PositionGoal
+from ibrobot_planning.planner import AnyGoal, Goal, JointGoal, LinearGoal, PlanRequest, PlanResult, PositionGoal
 
 from ibrobot_core.api import PlanningError, Vector3
 from ibrobot_core.app import PlanCode, Runtime
@@ -34,7 +35,7 @@ class Patience:
             raise PlanningError("cancelled", PlanCode.PREEMPTED)
 
 
-GOALS = {
+GOALS: Mapping[str, Goal] = {
     "joints": JointGoal(ARM, RIGHT),
     "alternatives": AnyGoal((PositionGoal(Vector3(9, 9, 9)), JointGoal(ARM, RIGHT), JointGoal(ARM, -RIGHT))),
     "position": PositionGoal(Vector3(0.25, -0.2, 0.15)),
@@ -97,6 +98,13 @@ class Beside:
         return self.answer
 
 
+def result_of(runtime: Runtime, number: int) -> MoveResult:
+    """The result of a goal that has ended."""
+    result = runtime.session.bus.call(RESULT, number)
+    assert result is not None
+    return result
+
+
 def steps(runtime: Runtime, ticks: int = 5) -> None:
     """Let time pass; a search begins within it."""
     for _ in range(ticks):
@@ -117,7 +125,7 @@ def test_cancel_ends_the_search_for_a_goal(runtime: Runtime, monkeypatch: pytest
     endless.begun.acquire()
     bus.call(CANCEL)
     stepping.join()
-    result = bus.call(RESULT, number)
+    result = result_of(runtime, number)
     assert (result.outcome, result.code, result.message) == ("CANCELLED", PlanCode.PREEMPTED, "cancelled")
 
 
@@ -133,7 +141,7 @@ def test_cancel_that_comes_before_the_search_ends_it_too(runtime: Runtime, monke
     monkeypatch.setattr(source, "_begin", cancelled_before)
     number = bus.call(GO_TO, "up")
     steps(runtime)
-    assert bus.call(RESULT, number).outcome == "CANCELLED"
+    assert result_of(runtime, number).outcome == "CANCELLED"
     assert not endless.begun.acquire(blocking=False), "it has not even begun"
 
 
@@ -146,8 +154,8 @@ def test_goal_that_replaces_another_ends_its_search(runtime: Runtime, monkeypatc
     second = bus.call(GO_TO, "pan=-0.3")
     stepping.join()
     steps(runtime, 200)
-    assert bus.call(RESULT, first).outcome == "CANCELLED"
-    assert bus.call(RESULT, second).outcome == "SUCCEEDED"
+    assert result_of(runtime, first).outcome == "CANCELLED"
+    assert result_of(runtime, second).outcome == "SUCCEEDED"
 
 
 def test_motion_comes_before_plans_that_move_nothing(runtime: Runtime, monkeypatch: pytest.MonkeyPatch):
@@ -164,7 +172,7 @@ def test_motion_comes_before_plans_that_move_nothing(runtime: Runtime, monkeypat
     endless.endless = False
     stepping.join()
     steps(runtime, 200)
-    assert bus.call(RESULT, number).outcome == "SUCCEEDED"
+    assert result_of(runtime, number).outcome == "SUCCEEDED"
 
 
 def test_cancel_ends_plans_that_move_nothing(runtime: Runtime, monkeypatch: pytest.MonkeyPatch):
