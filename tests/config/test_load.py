@@ -127,7 +127,7 @@ def test_several_hardware_components_own_their_joints(load_text: Load, base: str
 def test_relative_paths_start_at_the_file(load_text: Load, base: str, tmp_path: Path) -> None:
     config = load_text(base.replace("port: /dev/null}", "port: /dev/null, calibration: cal/left.json}"))
 
-    assert config.hardware["hardware"].options.calibration == tmp_path / "cal" / "left.json"
+    assert config.hardware["hardware"].options.offsets == tmp_path / "cal" / "left.json"
 
 
 def test_package_paths_are_found_without_an_import(

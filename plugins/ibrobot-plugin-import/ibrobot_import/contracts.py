@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ibrobot_core.api import MESSAGE_TYPES
-from ibrobot_import import so101
+from ibrobot_import import parts, so101
 from ibrobot_import.source import From, Node
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -33,7 +33,7 @@ def contract_section(
     observations = [_observation(each, body, peripherals or {}) for each in node["observations"].each()]
     actions = [part for each in node["actions"].each() for part in _actions(each, body)]
     if body is not None and not actions:
-        actions = [so101.action_part(name, body.origin) for name in so101.streams(body)]
+        actions = [parts.action_part(name, body.origin) for name in parts.streams(body)]
     values["observations"] = [each for each in observations if each is not None]
     values["actions"] = actions
     return {key: value for key, value in values.items() if value is not None and value != []}
@@ -164,7 +164,7 @@ def _actions(node: Node, body: so101.Body | None) -> list[dict[str, Any]]:
         part.changed(None, note)
     comment = f"{publish['topic'].origin}; {note}"
     added = {"safety_behavior": safety} if safety is not None else {}
-    return [so101.action_part(name, comment, node.line) | added for name in so101.streams(body)]
+    return [parts.action_part(name, comment, node.line) | added for name in parts.streams(body)]
 
 
 def _foreign_action(key: From, publish: Node, names: Node, behaviour: Node) -> dict[str, Any]:

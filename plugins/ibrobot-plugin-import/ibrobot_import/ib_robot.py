@@ -10,7 +10,7 @@ from typing import Any
 import attrs
 
 from ibrobot_core.app import installed_plugins
-from ibrobot_import import so101
+from ibrobot_import import parts, so101
 from ibrobot_import.contracts import contract_section
 from ibrobot_import.source import From, Node, Source, Titled, plain_name
 
@@ -134,10 +134,10 @@ def _sections(part: _Robot) -> dict[str, Any]:
     contract = contract_section(robot["contract"], body, peripherals)
     _executors_of_actions(part, contract)
     if not any(type_ == "position" for type_, *_ in part.executors.values()):
-        part.executors |= so101.streams(body)
+        part.executors |= parts.streams(body)
     _only_driven(modes, contract)
     streams = [name for name, (type_, *_) in part.executors.items() if type_ == "position"]
-    modes |= so101.added_modes(streams, list(modes))
+    modes |= parts.added_modes(streams, list(modes))
     robot.refuse_all(_SECTIONS)
     for recording in (robot["recording"], robot["contract"]["recording"]):
         recording.refuse("`ibrobot record` records, and takes --root and --dataset; all topics of the contract")
@@ -146,13 +146,13 @@ def _sections(part: _Robot) -> dict[str, Any]:
         "hardware": hardware,
         "simulation": _simulation(robot["simulation"]),
         "peripherals": list(peripherals.values()),
-        "executors": so101.executor_sections(part.executors),
+        "executors": parts.executor_sections(part.executors),
         "models": models,
         "control_modes": modes,
         "default_control_mode": _default_mode(robot["default_control_mode"], modes),
-        "teleoperation": devices | so101.WEB,
+        "teleoperation": devices | parts.WEB,
         "contract": contract,
-        "control": From(so101.CONTROL, "so101 of ibrobot"),
+        "control": From(parts.CONTROL, "so101 of ibrobot"),
     }
 
 
@@ -176,7 +176,7 @@ def _robot_section(part: _Robot) -> dict[str, Any]:
             node.refuse("the groups are those of the executors")
     reason = "planners plan for the executors' groups, with robot.description.tip as the tool"
     robot["moveit"].refuse_all({"arm_group_name base_link ee_link shoulder_link": reason})
-    return so101.robot_section(
+    return parts.robot_section(
         body,
         name,
         robot["robot_type"].text() or robot["type"].text(),
@@ -233,7 +233,7 @@ def _hardware_section(part: _Robot) -> dict[str, Any]:
     if arms > 1 and calibration is not None:
         node["calib_file"].drop("has the servos of two buses; each arm has its own calibration here")
         calibration = None
-    return so101.hardware_section(body, [port, *rest], [calibration, *rest])
+    return parts.hardware_section(body, [port, *rest], [calibration, *rest])
 
 
 def _peripherals(part: _Robot) -> dict[str, dict[str, Any]]:
@@ -254,7 +254,7 @@ def _peripherals(part: _Robot) -> dict[str, dict[str, Any]]:
         optical = node["optical_frame_id"].text()
         values |= {"frame_id": optical, "transform": _transform(node, part.body)}
         node.refuse_all(_CAMERA)
-        values["sim"] = so101.simulated(str(values["name"].value), part.body)
+        values["sim"] = parts.simulated(str(values["name"].value), part.body)
         peripherals[str(name.value)] = values
     return peripherals
 
@@ -432,7 +432,7 @@ def _simulation(node: Node) -> dict[str, Any]:
             given = scene.changed("empty", "no scene")
         else:
             given = scene.changed("empty", f"there is no scene {scene.value!r}; there are {', '.join(known)}")
-    return so101.simulation_section(type_, given)
+    return parts.simulation_section(type_, given)
 
 
 def _teleoperation(part: _Robot) -> dict[str, Any]:

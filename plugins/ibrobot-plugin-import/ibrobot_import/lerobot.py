@@ -10,7 +10,7 @@ from typing import Any
 
 from ibrobot_calibration import load_calibration
 
-from ibrobot_import import so101
+from ibrobot_import import parts, so101
 from ibrobot_import.source import Fate, From, Node, Source, Titled, plain_name
 
 _SINGLE = ("so100_follower", "so101_follower", "so_follower")
@@ -110,16 +110,16 @@ def _sections(
     if devices:
         names = list(devices)
         given: Any = names[0] if len(names) == 1 else dict(zip(body.groups, names, strict=True))
-        modes["teleop"] = so101.added_mode(list(so101.streams(body)), "the device of `teleop`", given)
-    observations = [so101.state_observation(body)]
+        modes["teleop"] = parts.added_mode(list(parts.streams(body)), "the device of `teleop`", given)
+    observations = [parts.state_observation(body)]
     observations += [
-        so101.picture_observation(From(f"observation.images.{name}", part["name"].comment, part["name"].line), name)
+        parts.picture_observation(From(f"observation.images.{name}", part["name"].comment, part["name"].line), name)
         for name, part in cameras.items()
     ]
-    robot = so101.robot_section(body, body.own(body.config), None)
-    hardware = so101.hardware_section(body, ports, calibrations)
+    robot = parts.robot_section(body, body.own(body.config), None)
+    hardware = parts.hardware_section(body, ports, calibrations)
     rate = From(30, "LeRobot's default")
-    return so101.sections(body, robot, hardware, list(cameras.values()), modes, devices, rate, observations)
+    return parts.sections(body, robot, hardware, list(cameras.values()), modes, devices, rate, observations)
 
 
 def _arms(robot: Node, body: so101.Body) -> list[Node]:
@@ -185,7 +185,7 @@ def _cameras(nodes: list[Node]) -> dict[str, Any]:
                 }
             values |= {key: camera[key].whole() for key in ("width", "height")} | {"fps": camera["fps"].number()}
             camera.refuse_all(_CAMERA)
-            values["sim"] = so101.simulated(plain, so101.DOUBLE if prefix in so101.DOUBLE.prefixes else so101.SINGLE)
+            values["sim"] = parts.simulated(plain, so101.DOUBLE if prefix in so101.DOUBLE.prefixes else so101.SINGLE)
             cameras[plain] = values
     return cameras
 
@@ -238,7 +238,7 @@ def _record(root: Node, sections: dict[str, Any]) -> None:
     if path.value is not None and (where := path.text()) is not None:
         model = {"type": From("lerobot", "added"), "path": where, "norm_mode": _norm_mode(root["robot"])}
         sections["models"] = {"policy": model}
-        executors = list(so101.streams(so101.SINGLE if root["robot"]["type"].value in _SINGLE else so101.DOUBLE))
+        executors = list(parts.streams(so101.SINGLE if root["robot"]["type"].value in _SINGLE else so101.DOUBLE))
         sections["control_modes"]["model_inference"] = path.titles(
             {"executors": From(executors, "added"), "inference": {"model": path.gives("policy")}}
         )

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ibrobot_core.api import MESSAGE_TYPES
-from ibrobot_import import so101
+from ibrobot_import import parts, so101
 from ibrobot_import.contracts import JOINT_STATE, QOS
 from ibrobot_import.source import Fate, From, Node, Source, plain_name
 
@@ -75,12 +75,12 @@ def _robot(root: Node, joints: Mapping[str, str]) -> dict[str, Any]:
         channel["type"].changed(None, "commands go to the executors")
         select.changed(None, "the joints of the executors")
         _rest(node, f"{key} is the action of an SO-101")
-    modes = {"teleop": so101.added_mode(list(so101.streams(body)), "the leader arm", "leader")}
+    modes = {"teleop": parts.added_mode(list(parts.streams(body)), "the leader arm", "leader")}
     devices = {"leader": body.own(so101.shipped(body.config)["teleoperation"]["leader"])}
     kind = root["robot_type"].text()
-    robot = so101.robot_section(body, kind or From(body.config, "added"), kind)
-    hardware = so101.hardware_section(body, [None], [None])
-    return so101.sections(body, robot, hardware, peripherals, modes, devices, root["fps"].number(), observations)
+    robot = parts.robot_section(body, kind or From(body.config, "added"), kind)
+    hardware = parts.hardware_section(body, [None], [None])
+    return parts.sections(body, robot, hardware, peripherals, modes, devices, root["fps"].number(), observations)
 
 
 def _camera(node: Node, name: str, number: int) -> dict[str, Any]:
@@ -94,7 +94,7 @@ def _camera(node: Node, name: str, number: int) -> dict[str, Any]:
         "width": From(640, "GUESS"),
         "height": From(480, "GUESS"),
         "fps": From(30, "GUESS"),
-        "sim": so101.simulated(name, so101.SINGLE),
+        "sim": parts.simulated(name, so101.SINGLE),
     }
 
 
