@@ -60,6 +60,24 @@ class TestDamiaoArm(HardwareSuite):
         super().elapse(hardware, ctx, duration_s)
         MemoryBus.wires["arm"].motors.settle()
 
+    @override
+    def has_torque(self, hardware: Hardware) -> bool:
+        (torque,) = {motor.state != OFF for motor in MemoryBus.wires["arm"].motors.motors}
+        return torque
+
+    @override
+    def lose_replies(self, hardware: Hardware) -> None:
+        for motor in MemoryBus.wires["arm"].motors.motors:
+            motor.silent = True
+
+    @override
+    def unplug(self, hardware: Hardware) -> None:
+        MemoryBus.wires["arm"].gone = True
+
+    @override
+    def stall(self, hardware: Hardware, joint: int) -> None:
+        MemoryBus.wires["arm"].motors.motors[joint].blocked = True
+
 
 @contextmanager
 def connected(clock: SteppedClock, **changes: Any) -> Iterator[DamiaoArm]:

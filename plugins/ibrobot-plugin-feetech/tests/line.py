@@ -11,6 +11,7 @@ from typing import Any, ClassVar, override
 import pytest
 from ibrobot_feetech import bus, follower, sync
 from ibrobot_feetech.emulator import Emulator
+from ibrobot_feetech.errors import Place, PortError
 from ibrobot_feetech.port import SerialPort
 
 from ibrobot_core.api import seconds
@@ -25,6 +26,9 @@ class Line(Emulator):
     now_s: ClassVar[float] = 1000.0
     served: ClassVar[dict[str, Line]] = {}
     _numbers: ClassVar[itertools.count[int]] = itertools.count()
+
+    gone = False
+    """Whether its cable is unplugged."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -45,6 +49,10 @@ class Line(Emulator):
     @override
     def stop(self) -> None:
         del Line.served[self.port]
+
+    @override
+    def unplug(self) -> None:
+        self.gone = True
 
     def ask(self, request: bytes) -> None:
         Line.now_s += _REQUEST_S
@@ -82,6 +90,10 @@ class LinePort(SerialPort):
 
     _line: Line | None = None
 
+    def _unplugged(self) -> None:
+        if self._line is not None and self._line.gone:
+            raise PortError(Place(self.path), "the port is gone")
+
     @property
     @override
     def is_open(self) -> bool:
@@ -100,6 +112,7 @@ class LinePort(SerialPort):
 
     @override
     def write(self, request: bytes) -> None:
+        self._unplugged()
         if self._line is None:
             super().write(request)
         else:
@@ -107,10 +120,12 @@ class LinePort(SerialPort):
 
     @override
     def read(self, size: int, deadline: float) -> bytes:
+        self._unplugged()
         return super().read(size, deadline) if self._line is None else self._line.take(size, deadline)
 
     @override
     def exchange(self, request: bytes, size: int, timeout_ms: int) -> bytes:
+        self._unplugged()
         if self._line is None:
             return super().exchange(request, size, timeout_ms)
         self._line.ask(request)

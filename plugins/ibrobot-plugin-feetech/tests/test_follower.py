@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, override
 
@@ -66,8 +66,27 @@ class TestFollower(HardwareSuite):
 
     @override
     def elapse(self, hardware: Hardware, ctx: Context, duration_s: float) -> None:
-        hardware.read()  # once it is answered, the goals sent before it have arrived
+        with suppress(HardwareError):
+            hardware.read()  # once it is answered, the goals sent before it have arrived
         super().elapse(hardware, ctx, duration_s)
+
+    @override
+    def has_torque(self, hardware: Hardware) -> bool:
+        with self.emulator.lock:
+            (torque,) = {servo.torque for servo in self.emulator.servos.values()}
+        return torque
+
+    @override
+    def lose_replies(self, hardware: Hardware) -> None:
+        self.emulator.faults.silent |= set(self.emulator.servos)
+
+    @override
+    def unplug(self, hardware: Hardware) -> None:
+        self.emulator.unplug()
+
+    @override
+    def stall(self, hardware: Hardware, joint: int) -> None:
+        self.emulator.faults.blocked.add(joint + 1)
 
 
 class Rig:

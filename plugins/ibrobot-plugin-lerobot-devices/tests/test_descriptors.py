@@ -39,7 +39,7 @@ lerobot = command_line("lerobot")
 def test_functions_of_the_descriptors(hook: str, options: Any) -> None:
     (descriptor,) = (each for each in getattr(ibrobot_lerobot_devices, hook)() if isinstance(options, each.options))
     check_descriptor(descriptor, options)
-    assert list(descriptor.check_options(options, make_robot(), make_robot().joint_names)) == []
+    assert list(options.check(make_robot(), make_robot().joint_names)) == []
 
 
 @pytest.mark.parametrize(

@@ -70,6 +70,8 @@ def assert_within_limits(outcome: Outcome) -> None:
 
 
 class TestConformance(PolicySuite):
+    ignores = frozenset({"observation.state"})  # it knows the scene, and begins at its rest pose
+
     @override
     def make(self, ctx: Context) -> Policy:
         return scripted_pick(ctx)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -21,6 +22,8 @@ from ibrobot_core.app import Registry, RequestError, Unsuccessful, echo, install
 HEAVY = ("av", "cv2", "lerobot", "mujoco", "numpy", "pinocchio", "pyarrow", "scipy", "torch")
 """Libraries that take long to import, and that each `ibrobot` command would import if a plugin did at discovery."""
 _CORE = "ibrobot-core"
+_HOOK = re.compile(r"SKIPPED .*: override (\w+) to have")
+"""What the suites say of a check that needs a hook."""
 _TESTS_S = 600.0
 
 
@@ -80,7 +83,7 @@ def examine(package: str, registry: Registry) -> Iterator[Check]:
     for each in registry.messages.values():
         if each.message.place.partition(":")[0].partition(".")[0] in modules:
             yield _message(each)
-    yield _tests(installed)
+    yield from _tests(installed)
 
 
 def _versions(package: Distribution) -> Iterator[Check]:
@@ -143,28 +146,34 @@ def _message(descriptor: MessageDescriptor) -> Check:
     return Check(name, True, f"{descriptor.message.place} is there")
 
 
-def _tests(package: Distribution) -> Check:
-    """Run its tests, if its source is here."""
+def _tests(package: Distribution) -> Iterator[Check]:
+    """Run its tests, if its source is here, and name what they could not check."""
     folder = _source(package)
     if folder is None:
-        return Check(
+        yield Check(
             "tests", False, "not run: wheels have no tests; install its source by pip install -e", matters=False
         )
+        return
     tests = folder / "tests"
     texts = [file.read_text(encoding="utf-8") for file in sorted(tests.rglob("test_*.py"))] if tests.is_dir() else []
     if not any("Suite)" in text for text in texts):
-        return Check(
+        yield Check(
             "tests", False, f"{tests} has no conformance suite", "subclass the suite of its kind, of ibrobot_testing"
         )
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"]
+        return
+    command = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "tests"]
     try:
         done = subprocess.run(
             command, cwd=folder, capture_output=True, text=True, errors="replace", check=False, timeout=_TESTS_S
         )
     except subprocess.TimeoutExpired:
-        return Check("tests", False, f"did not end within {_TESTS_S:g} s", f"cd {folder} && pytest")
+        yield Check("tests", False, f"did not end within {_TESTS_S:g} s", f"cd {folder} && pytest")
+        return
     lines = done.stdout.strip().splitlines() or done.stderr.strip().splitlines() or ["no output"]
-    return Check("tests", done.returncode == 0, lines[-1].strip("= "), f"cd {folder} && pytest")
+    yield Check("tests", done.returncode == 0, lines[-1].strip("= "), f"cd {folder} && pytest")
+    if hooks := sorted(set(_HOOK.findall(done.stdout))):
+        remedy = "how-to/test-a-plugin says what each makes the device do"
+        yield Check("not checked", False, f"the suite overrides no {', '.join(hooks)}", remedy, matters=False)
 
 
 def _source(package: Distribution) -> Path | None:

@@ -22,6 +22,7 @@ from ibrobot_core.api import (
     Torque,
     Vector,
     ns,
+    seconds,
 )
 from ibrobot_testing.contexts import control_context
 from ibrobot_testing.suite import Suite
@@ -34,6 +35,8 @@ class HardwareSuite(Suite[Hardware]):
     """Time within which every joint moves at least half-way to a nearby command [s]."""
     move_rad = 0.2
     """Distance by which the checks move a joint [rad]."""
+    reach = 0.5
+    """Share of each joint's range, around its middle, that the checks command."""
     tolerance_rad = 0.03
     """Allowed motion of a holding joint [rad]."""
     quantum_rad = 0.004
@@ -49,6 +52,22 @@ class HardwareSuite(Suite[Hardware]):
             ctx.clock.sleep_until(ctx.clock.now_ns() + ctx.period_ns)
             if isinstance(hardware, SimulatedHardware):
                 hardware.advance(ctx.period_ns)
+
+    def has_torque(self, hardware: Hardware) -> bool:
+        """Whether the device itself has torque: its fake or emulator knows. Override it to have torque checked."""
+        pytest.skip("override has_torque to have this checked")
+
+    def lose_replies(self, hardware: Hardware) -> None:
+        """Make the device answer nothing from now on, while it stays plugged in. Override it to have this checked."""
+        pytest.skip("override lose_replies to have this checked")
+
+    def unplug(self, hardware: Hardware) -> None:
+        """Take the device away, as if its cable was pulled. Override it to have this checked."""
+        pytest.skip("override unplug to have this checked")
+
+    def stall(self, hardware: Hardware, joint: int) -> None:
+        """Block a joint, whatever it is commanded. Override it to have this checked."""
+        pytest.skip("override stall to have this checked")
 
     def connected(self, *, again: bool = False) -> AbstractContextManager[tuple[Hardware, Context]]:
         """Connected hardware with its context; for `again` see `in_use`."""
@@ -66,6 +85,16 @@ class HardwareSuite(Suite[Hardware]):
         reached = hardware.read().position.copy()
         assert (np.abs(reached - goal) < 0.5 * np.abs(start - goal)).all(), "the joints did not stay at the command"
         return reached
+
+    def _wait_for(self, hardware: Hardware, ctx: Context, goal: Vector, joint: int) -> None:
+        """Let the joint come near its goal, as long as it gets nearer."""
+        hardware.write(goal)
+        left = abs(hardware.read().position[joint] - goal[joint])
+        while left > self.move_rad / 2:
+            self.elapse(hardware, ctx, self.settle_s / 2)
+            before, left = left, abs(hardware.read().position[joint] - goal[joint])
+            if left > before - self.quantum_rad:
+                return
 
     def _check_rest(self, hardware: Hardware, ctx: Context, position: Vector) -> None:
         """Check that the joints stay at a position [rad], shape (J,), for `settle_s`."""
@@ -163,6 +192,55 @@ class HardwareSuite(Suite[Hardware]):
                 left = np.abs(hardware.read().position - goal)
                 assert left[i] < 0.5 * abs(goal[i] - start[i]), f"{name} did not move half-way in {self.settle_s} s"
                 assert np.delete(left, i).max(initial=0.0) < 0.5 * self.move_rad, f"{name} moved another joint"
+
+    def test_reaches_the_ends_of_the_way(self) -> None:
+        """Each joint follows commands to both ends of `reach`: the driver has no bounds of its own."""
+        with self.connected() as (hardware, ctx):
+            order = ctx.robot.indices(hardware.joints)
+            lower, upper = ctx.robot.lower[order], ctx.robot.upper[order]
+            middle, half = (lower + upper) / 2, self.reach / 2 * (upper - lower)
+            goal = middle.copy()
+            for i in range(len(goal)):
+                self._wait_for(hardware, ctx, goal, i)
+            for i, name in enumerate(hardware.joints):
+                for end in (middle[i] - half[i], middle[i] + half[i]):
+                    goal[i] = end
+                    self._wait_for(hardware, ctx, goal, i)
+                    measured = hardware.read().position[i]
+                    assert abs(measured - end) <= self.move_rad, f"{name} stops at {measured:.2f} rad, not at {end:.2f}"
+                goal[i] = middle[i]
+                self._wait_for(hardware, ctx, goal, i)
+
+    def test_velocity_is_that_of_the_motion(self) -> None:
+        """Velocities of a moving joint add up to about the way that it went, in its direction: rad/s, not degrees."""
+        with self.connected() as (hardware, ctx):
+            for _ in range(5):  # so that a velocity made of differences has its readings
+                self.elapse(hardware, ctx, 0.0)
+                start = hardware.read()
+            hardware.write(self._target(hardware, ctx))
+            ways, before = np.zeros(len(hardware.joints)), start
+            for _ in range(max(10, round(ns(self.settle_s) / ctx.period_ns))):
+                self.elapse(hardware, ctx, 0.0)
+                now = hardware.read()
+                mean = (before.velocity + now.velocity) / 2
+                ways, before = ways + mean * seconds(now.stamp_ns - before.stamp_ns), now
+            went = before.position - start.position
+            for name, way, true in zip(hardware.joints, ways, went, strict=True):
+                # By a factor of 4 at most, for devices that move within a few ticks.
+                assert 0.25 < way / true < 4, f"{name} went {true:.2f} rad, its velocities say {way:.2f}"
+
+    def test_effort_is_measured_or_missing(self) -> None:
+        """Effort that nothing measures is NaN: exactly 0 in motion and at rest, it would look like a free joint."""
+        with self.connected() as (hardware, ctx):
+            hardware.write(self._target(hardware, ctx))
+            efforts = []
+            for _ in range(20):
+                self.elapse(hardware, ctx, 0.0)
+                efforts.append(hardware.read().effort.copy())
+            silent = [
+                name for name, values in zip(hardware.joints, np.transpose(efforts), strict=True) if not values.any()
+            ]
+            assert not silent, f"effort of {', '.join(silent)} is 0 in all readings; what is not measured is NaN"
 
     def test_refuses_a_command_of_wrong_shape(self) -> None:
         """A vector of wrong length is refused (HardwareError or ValueError) and moves nothing."""
@@ -273,6 +351,68 @@ class HardwareSuite(Suite[Hardware]):
                 self.elapse(hardware, ctx, 0.0)
                 away = np.abs(hardware.read().position - before).max()
                 assert away < self.tolerance_rad, f"a joint jumped by {away:.3f} rad when torque came back"
+
+    def test_the_device_loses_torque_with_relax_and_has_it_with_the_next_write(self) -> None:
+        """What `relax` reports is what the device does."""
+        with self.connected() as (hardware, ctx):
+            assert self.has_torque(hardware), "the device has no torque after connect"
+            if self._relax(hardware) is Torque.OFF:
+                assert not self.has_torque(hardware), "relax reports OFF, but the device still has torque"
+            hardware.write(hardware.read().position)
+            self.elapse(hardware, ctx, 0.0)
+            assert self.has_torque(hardware), "the device has no torque after a write"
+
+    def test_the_device_keeps_its_torque_when_it_is_disconnected(self) -> None:
+        """`disconnect` drops no arm: what holds without a process goes on, and `undo_connect` leaves no torque."""
+        with self.connected() as (hardware, _):
+            self.has_torque(hardware)
+            if hardware.holding() is None:
+                pytest.skip("holds nothing without a process")
+            hardware.disconnect()
+            assert self.has_torque(hardware), "disconnect took the torque off: an arm falls"
+            hardware.connect()
+            hardware.undo_connect()
+            assert not self.has_torque(hardware), "undo_connect left the torque on"
+
+    def test_a_lost_reply_is_no_new_reading(self) -> None:
+        """Without replies, `read` raises HardwareError, or the reading is stale, or has the stamp of the last reply."""
+        with self.connected() as (hardware, ctx):
+            hardware.write(self._target(hardware, ctx))
+            self.elapse(hardware, ctx, self.settle_s / 4)
+            last_ns = hardware.read().stamp_ns
+            self.lose_replies(hardware)
+            for _ in range(10):
+                self.elapse(hardware, ctx, 0.0)
+                try:
+                    reading = hardware.read()
+                except HardwareError:
+                    return
+                fresh = reading.stamp_ns > last_ns and not reading.stale
+                assert not fresh, "a reading has a new stamp and is not stale, though nothing answered"
+
+    def test_an_unplugged_device_is_an_error(self) -> None:
+        """`read` raises HardwareError within a second, and `disconnect` still works."""
+        with self.connected() as (hardware, ctx):
+            hardware.write(hardware.read().position)
+            self.unplug(hardware)
+
+            def until_gone() -> None:
+                for _ in range(max(10, round(ns(1.0) / ctx.period_ns))):
+                    self.elapse(hardware, ctx, 0.0)
+                    hardware.read()
+
+            with pytest.raises(HardwareError):
+                until_gone()
+
+    def test_a_blocked_joint_is_measured_where_it_is(self) -> None:
+        """Positions are measured: those of a joint that cannot move do not follow its commands."""
+        with self.connected() as (hardware, ctx):
+            start = hardware.read().position.copy()
+            self.stall(hardware, 0)
+            hardware.write(self._target(hardware, ctx))
+            self.elapse(hardware, ctx, self.settle_s)
+            way = abs(hardware.read().position[0] - start[0])
+            assert way < self.move_rad / 4, f"a blocked joint is said to have moved {way:.2f} rad"
 
     def test_reset_faults_moves_nothing(self) -> None:
         """`reset_faults` on healthy hardware changes nothing."""

@@ -23,6 +23,19 @@ class PolicySuite(Suite[Policy]):
 
     any_size: ClassVar[int] = 16
     """Replacement of -1 in the shapes of `frame`."""
+    ignores: ClassVar[frozenset[str]] = frozenset()
+    """Observations of the spec that do not affect the actions, e.g. the pictures of a policy without eyes."""
+
+    def reference(self, ctx: Context) -> Iterator[tuple[Frame, NDArray[np.float64]]]:
+        """Frames, and the chunks for them after `reset(0)` by another implementation, e.g. that of the training.
+
+        Override it: colours in another order, degrees and reversed joints differ from it, and from nothing else.
+        """
+        pytest.skip("override reference to have chunks compared with those of the original")
+
+    def another(self, ctx: Context) -> Policy:
+        """A policy with other weights or statistics; override it to have `fingerprint` and `weights` checked."""
+        pytest.skip("override another to have fingerprints checked")
 
     def frame(self, policy: Policy, ctx: Context, seed: int) -> Frame:
         """A frame with all inputs of the policy's spec; override it if random numbers are not suitable."""
@@ -72,6 +85,51 @@ class PolicySuite(Suite[Policy]):
         with self.loaded() as (policy, ctx):
             for chunk in self._run(policy, ctx, 1):
                 _check_chunk(chunk, policy.spec)
+
+    def test_chunks_have_the_length_of_the_spec(self) -> None:
+        """Of several chunks, the longest has `chunk_size` actions: plans are made for this length."""
+        with self.loaded() as (policy, ctx):
+            longest = max(len(chunk) for chunk in self._run(policy, ctx, 1))
+            assert longest == policy.spec.chunk_size, f"no chunk is longer than {longest}"
+
+    def test_chunks_are_those_of_the_reference(self) -> None:
+        """The chunks are those of another implementation, to 1e-4."""
+        with self.loaded() as (policy, ctx):
+            for frame, expected in self.reference(ctx):
+                policy.reset(0)
+                chunk = policy.postprocess(policy.infer(policy.preprocess(frame)))
+                np.testing.assert_allclose(chunk, expected, rtol=1e-4, atol=1e-4)
+
+    def test_each_observation_matters(self) -> None:
+        """A change of any observation but those of `ignores` changes the chunk."""
+        with self.loaded() as (policy, ctx):
+            whole, other = self.frame(policy, ctx, 1), self.frame(policy, ctx, 2)
+            policy.reset(0)
+            chunk = policy.postprocess(policy.infer(policy.preprocess(whole))).copy()
+            for key in policy.spec.observations.keys() - self.ignores:
+                policy.reset(0)
+                changed = attrs.evolve(whole, values={**whole.values, key: other.values[key]})
+                moved = policy.postprocess(policy.infer(policy.preprocess(changed)))
+                assert not np.array_equal(moved, chunk), f"{key} does not affect the actions; if so, name it in ignores"
+
+    def test_other_policies_have_other_fingerprints(self) -> None:
+        """Another policy differs in `fingerprint` or, once it is loaded, in `weights`."""
+        with self.loaded() as (policy, ctx):
+            other = self.another(ctx)
+            try:
+                other.load()
+                mine = policy.fingerprint(), policy.weights()
+                assert mine != (other.fingerprint(), other.weights()), "nothing tells the two policies apart"
+            finally:
+                other.close()
+
+    def test_weights_come_with_load(self) -> None:
+        """`weights` is empty before `load`: the constructor reads configuration and statistics only."""
+        policy = self.make(self.context())
+        try:
+            assert policy.weights() == "", "the constructor has read the weights"
+        finally:
+            policy.close()
 
     def test_a_prefix_of_any_length_is_taken(self) -> None:
         """A policy with `prefix` returns valid chunks for prefixes of one action, several, and a whole chunk."""

@@ -127,8 +127,18 @@ def test_tests_of_the_source_are_run(site: Site, tmp_path: Path, monkeypatch: py
     check = checks()["tests"]
     assert not check.ok
     assert "1 failed" in check.found
+    assert "not checked" not in checks()
     (folder / "tests/test_odd_one.py").write_text("def test_nothing(): pass\n")
     assert checks()["tests"].found.endswith("has no conformance suite")
+
+
+def test_checks_that_need_a_hook_are_listed(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(site)
+    folder = Path(NewPlugin("policy", "odd_one", tmp_path)()["folder"])
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+    as_source(site, folder)
+    check = checks()["not checked"]
+    assert (check.found, check.matters) == ("the suite overrides no another, reference", False)
 
 
 @pytest.mark.parametrize(

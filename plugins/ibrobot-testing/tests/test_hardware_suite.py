@@ -10,7 +10,7 @@ import pytest
 from ibrobot_testing import HardwareSuite, SimulatedHardwareSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakeHardware, FakeRealHardware
 
-from ibrobot_core.api import Condition, EpisodeSetup, HardwareError, Holding, JointReading, Severity, Signal
+from ibrobot_core.api import Condition, EpisodeSetup, HardwareError, Holding, JointReading, Severity, Signal, Torque
 
 
 class TestRealHardware(HardwareSuite):
@@ -19,84 +19,139 @@ class TestRealHardware(HardwareSuite):
         return FakeRealHardware(ctx)
 
 
+class Device(FakeHardware):
+    """A fake whose device has torque of its own, may fall silent, be unplugged, or be blocked."""
+
+    torque = silent = unplugged = False
+    stalled = -1
+    answer = None
+
+    def connect(self):
+        super().connect()
+        self.torque = True
+
+    def write(self, position):
+        super().write(position)
+        self.torque = True
+
+    def relax(self):
+        self.torque = False
+        return super().relax()
+
+    def holding(self):
+        return Holding("the device", "torque off") if self.torque else None
+
+    def undo_connect(self):
+        self.torque = False
+
+    def read(self):
+        if self.unplugged:
+            raise HardwareError("the device is gone")
+        if not self.silent:
+            self.answer = super().read()
+        return self.answer
+
+    def advance(self, step_ns):
+        blocked = self._position[self.stalled]
+        super().advance(step_ns)
+        if self.stalled >= 0:
+            self._position[self.stalled] = blocked
+
+
 class TestSimulatedHardware(SimulatedHardwareSuite):
     @override
     def make(self, ctx):
-        return FakeHardware(ctx)
+        return Device(ctx)
+
+    @override
+    def has_torque(self, hardware):
+        return hardware.torque
+
+    @override
+    def lose_replies(self, hardware):
+        hardware.silent = True
+
+    @override
+    def unplug(self, hardware):
+        hardware.unplugged = True
+
+    @override
+    def stall(self, hardware, joint):
+        hardware.stalled = joint
 
 
-class OtherJoints(FakeHardware):
+class OtherJoints(Device):
     def __init__(self, ctx):
         super().__init__(ctx)
         self.joints = ctx.joints[::-1]
 
 
-class ShortVelocity(FakeHardware):
+class ShortVelocity(Device):
     def read(self):
         r = super().read()
         return JointReading(r.stamp_ns, r.position, r.velocity[1:], r.effort)
 
 
-class NotANumber(FakeHardware):
+class NotANumber(Device):
     def read(self):
         r = super().read()
         return JointReading(r.stamp_ns, np.full_like(r.position, np.nan), r.velocity, r.effort)
 
 
-class StampsStandStill(FakeHardware):
+class StampsStandStill(Device):
     def read(self):
         r = super().read()
         return JointReading(1, r.position, r.velocity, r.effort)
 
 
-class StampsAhead(FakeHardware):
+class StampsAhead(Device):
     def read(self):
         r = super().read()
         return JointReading(r.stamp_ns + 10**9, r.position, r.velocity, r.effort)
 
 
-class DriftsToZero(FakeHardware):
+class DriftsToZero(Device):
     def advance(self, step_ns):
         super().advance(step_ns)
         self._command = self._command * 0.98
 
 
-class HomesOnConnect(FakeHardware):
+class HomesOnConnect(Device):
     def connect(self):
         super().connect()
         self._command = np.zeros_like(self._command)
 
 
-class IgnoresCommands(FakeHardware):
+class IgnoresCommands(Device):
     def write(self, position):
         command = self._command
         super().write(position)
         self._command = command
 
 
-class SwapsJoints(FakeHardware):
+class SwapsJoints(Device):
     def write(self, position):
         super().write(position[::-1] if position.shape == self._position.shape else position)
 
 
-class Degrees(FakeHardware):
+class Degrees(Device):
     def read(self):
         r = super().read()
         return JointReading(r.stamp_ns, np.degrees(r.position), np.degrees(r.velocity), r.effort)
 
 
-class BroadcastsCommands(FakeHardware):
+class BroadcastsCommands(Device):
     def write(self, position):
         super().write(np.resize(position, self._position.shape))
 
 
-class KeepsTheCommand(FakeHardware):
+class KeepsTheCommand(Device):
     def write(self, position):
         super().write(position)
         self._command = position
 
 
-class ReusesItsReading(FakeHardware):
+class ReusesItsReading(Device):
     def read(self):
         r = super().read()
         self._buffer = getattr(self, "_buffer", r.position)
@@ -104,47 +159,47 @@ class ReusesItsReading(FakeHardware):
         return JointReading(r.stamp_ns, self._buffer, r.velocity, r.effort)
 
 
-class DisconnectsOnce(FakeHardware):
+class DisconnectsOnce(Device):
     def disconnect(self):
         self._check_open()
         super().disconnect()
 
 
-class ReadsWhileDisconnected(FakeHardware):
+class ReadsWhileDisconnected(Device):
     def _check_open(self):
         pass
 
 
-class StaysRelaxed(FakeHardware):
+class StaysRelaxed(Device):
     def write(self, position):
         relaxed = self.relaxed
         super().write(position)
         self.relaxed = relaxed
 
 
-class RelaxReportsNothing(FakeHardware):
+class RelaxReportsNothing(Device):
     def relax(self):
         super().relax()
 
 
-class HoldsOnAfterRelax(FakeHardware):
+class HoldsOnAfterRelax(Device):
     def holding(self):
         return Holding("somewhere", "torque off") if self._open else None
 
 
-class NamesNoCommand(FakeHardware):
+class NamesNoCommand(Device):
     def holding(self):
         return Holding("somewhere", "") if self._open and not self.relaxed else None
 
 
-class ForgetsWhatHolds(FakeHardware):
+class ForgetsWhatHolds(Device):
     """Holds while it is connected only: but torque stays on when the port is released."""
 
     def holding(self):
         return Holding("somewhere", "torque off") if self._open and not self.relaxed else None
 
 
-class LeavesTorqueOn(FakeHardware):
+class LeavesTorqueOn(Device):
     on = False
 
     def connect(self):
@@ -158,42 +213,42 @@ class LeavesTorqueOn(FakeHardware):
         pass
 
 
-class ConditionOfAnUnknownJoint(FakeHardware):
+class ConditionOfAnUnknownJoint(Device):
     def health(self):
         return (Condition("nose", "temperature", 70.0, "deg C", Severity.FAULT, "nose is hot: let it cool"),)
 
 
-class ConditionWithoutAValue(FakeHardware):
+class ConditionWithoutAValue(Device):
     def health(self):
         joint = self.joints[0]
         return (Condition(joint, "voltage", np.nan, "V", Severity.WARNING, f"{joint} has no voltage: see its cable"),)
 
 
-class ConditionTwice(FakeHardware):
+class ConditionTwice(Device):
     def health(self):
         hot = Condition(self.joints[0], "temperature", 70.0, "deg C", Severity.FAULT, f"{self.joints[0]} is hot")
         return (hot, hot)
 
 
-class ResetFaultsHomes(FakeHardware):
+class ResetFaultsHomes(Device):
     def reset_faults(self):
         self._command = np.zeros_like(self._command)
 
 
-class ShortSignal(FakeHardware):
+class ShortSignal(Device):
     signals = (Signal("/fake/command", 3),)
 
     def read_signal(self, index, out):
         out[0] = 1.0
 
 
-class MovesWithoutAdvance(FakeHardware):
+class MovesWithoutAdvance(Device):
     def read(self):
         self.advance(1_000_000)
         return super().read()
 
 
-class RandomFriction(FakeHardware):
+class RandomFriction(Device):
     random: ClassVar = np.random.default_rng()
 
     def advance(self, step_ns):
@@ -201,12 +256,12 @@ class RandomFriction(FakeHardware):
         self._position = self._position + self.random.normal(0, 1e-9, self._position.shape)
 
 
-class SeedFromTheObject(FakeHardware):
+class SeedFromTheObject(Device):
     def reset(self, episode):
         super().reset(EpisodeSetup(episode.seed + id(self)))
 
 
-class RemembersTheCommand(FakeHardware):
+class RemembersTheCommand(Device):
     def reset(self, episode):
         command = getattr(self, "_command", None)
         super().reset(episode)
@@ -214,12 +269,12 @@ class RemembersTheCommand(FakeHardware):
             self._command = command
 
 
-class AlwaysSucceeds(FakeHardware):
+class AlwaysSucceeds(Device):
     def success(self):
         return True
 
 
-class LimitsItself(FakeHardware):
+class LimitsItself(Device):
     """Correct in all but this: it raises for what the safety layer let pass."""
 
     def write(self, position):
@@ -228,7 +283,7 @@ class LimitsItself(FakeHardware):
         super().write(position)
 
 
-class TorqueByWayOfZero(FakeHardware):
+class TorqueByWayOfZero(Device):
     """The goal register has zero while torque is off, and the joints are pulled there until the command arrives."""
 
     back = 0
@@ -245,7 +300,7 @@ class TorqueByWayOfZero(FakeHardware):
         self._command = command
 
 
-class RepeatsALostReply(FakeHardware):
+class RepeatsALostReply(Device):
     """Of fast joints, every seventh reading has the positions of the one before, and a new stamp."""
 
     number = 0
@@ -263,7 +318,7 @@ class RepeatsALostReply(FakeHardware):
         return JointReading(r.stamp_ns, self.last.copy(), r.velocity, r.effort)
 
 
-class RepeatsATick(FakeHardware):
+class RepeatsATick(Device):
     """Of fast joints, all readings of every seventh tick have the positions of the tick before, and a new stamp."""
 
     stamp_ns = ticks = 0
@@ -282,7 +337,7 @@ class RepeatsATick(FakeHardware):
         return JointReading(r.stamp_ns, self.now.copy(), r.velocity, r.effort)
 
 
-class AlwaysStale(FakeHardware):
+class AlwaysStale(Device):
     """Each reading is that of the tick before, as from a queue that nobody empties."""
 
     queue: Any = ()
@@ -293,19 +348,93 @@ class AlwaysStale(FakeHardware):
         return JointReading(r.stamp_ns, self.queue[0].copy(), r.velocity, r.effort)
 
 
-class BlocksInRead(FakeHardware):
+class FallsOnDisconnect(Device):
+    def disconnect(self):
+        super().disconnect()
+        self.torque = False
+
+    def holding(self):
+        return Holding("the device", "torque off") if not self.relaxed and hasattr(self, "_command") else None
+
+
+class RelaxesInNameOnly(Device):
+    def relax(self):
+        super().relax()
+        self.torque = True
+        return Torque.OFF
+
+
+class NewStampWithoutAReply(Device):
+    def read(self):
+        r = super().read()
+        return JointReading(self._ctx.clock.now_ns(), r.position, r.velocity, r.effort)
+
+
+class GoesOnUnplugged(Device):
+    def read(self):
+        self.unplugged = False
+        return super().read()
+
+
+class ReportsItsCommands(Device):
+    def read(self):
+        r = super().read()
+        return JointReading(r.stamp_ns, self._command.copy(), r.velocity, r.effort)
+
+
+class NoVelocity(Device):
+    def read(self):
+        r = super().read()
+        return JointReading(r.stamp_ns, r.position, np.zeros_like(r.velocity), r.effort)
+
+
+class NegativeVelocity(Device):
+    def read(self):
+        r = super().read()
+        return JointReading(r.stamp_ns, r.position, -r.velocity, r.effort)
+
+
+class VelocityInDegrees(Device):
+    def read(self):
+        r = super().read()
+        return JointReading(r.stamp_ns, r.position, np.degrees(r.velocity), r.effort)
+
+
+class EffortOfZero(Device):
+    def read(self):
+        r = super().read()
+        return JointReading(r.stamp_ns, r.position, r.velocity, np.zeros_like(r.effort))
+
+
+class ClampsCommands(Device):
+    def write(self, position):
+        super().write(position)
+        self._command = np.clip(position, -0.5, 0.5)
+
+
+class BlocksInRead(Device):
     def read(self):
         time.sleep(0.05)
         return super().read()
 
 
-class BlocksInWrite(FakeHardware):
+class BlocksInWrite(Device):
     def write(self, position):
         super().write(position)
         time.sleep(0.02)
 
 
 WRONG = {
+    FallsOnDisconnect: "the_device_keeps_its_torque_when_it_is_disconnected",
+    RelaxesInNameOnly: "the_device_loses_torque_with_relax_and_has_it_with_the_next_write",
+    NewStampWithoutAReply: "a_lost_reply_is_no_new_reading",
+    GoesOnUnplugged: "an_unplugged_device_is_an_error",
+    ReportsItsCommands: "a_blocked_joint_is_measured_where_it_is",
+    NoVelocity: "velocity_is_that_of_the_motion",
+    NegativeVelocity: "velocity_is_that_of_the_motion",
+    VelocityInDegrees: "velocity_is_that_of_the_motion",
+    EffortOfZero: "effort_is_measured_or_missing",
+    ClampsCommands: "reaches_the_ends_of_the_way",
     TorqueByWayOfZero: "torque_returns_without_a_jump",
     RepeatsALostReply: "readings_are_new",
     RepeatsATick: "readings_are_new",

@@ -10,13 +10,98 @@ import pytest
 from ibrobot_testing import PolicySuite, checks, failed_checks
 from ibrobot_testing.fakes import FakePolicy
 
-from ibrobot_core.api import PolicyError
+from ibrobot_core.api import Frame, PolicyError
+
+
+class SeeingPolicy(FakePolicy):
+    """Sees one picture, whose red draws the joints on; it has weights."""
+
+    gain = 0.0
+
+    def __init__(self, ctx, trained=0.5):
+        super().__init__(ctx)
+        size = self.spec.action_size
+        seen = {"observation.state": (size,), "observation.images.top": (4, 4, 3)}
+        self.spec = attrs.evolve(self.spec, observations=seen)
+        self._trained = trained
+
+    def load(self):
+        self.gain = self._trained
+
+    def weights(self):
+        return f"{self.gain}" if self.gain else ""
+
+    def preprocess(self, frame):
+        picture = frame.observation("observation.images.top", (4, 4, 3))
+        return {**super().preprocess(frame), "red": picture[..., 0].mean(keepdims=True)}
+
+    def infer(self, tensors):
+        outputs = super().infer(tensors)
+        return {**outputs, "delta": outputs["delta"] + self.gain * tensors["red"] / 255}
 
 
 class TestPolicy(PolicySuite):
     @override
     def make(self, ctx):
-        return FakePolicy(ctx)
+        return SeeingPolicy(ctx)
+
+    @override
+    def another(self, ctx):
+        kind = type(self.make(ctx))
+        return (kind if issubclass(kind, SeeingPolicy) else SeeingPolicy)(ctx, trained=0.7)
+
+    @override
+    def reference(self, ctx):
+        goal = np.random.default_rng(0).uniform(-0.5, 0.5, 6)
+        shares = np.linspace(0.1, 1.0, 10)[:, None]
+        for red in (0, 100, 255):
+            state = np.linspace(-0.4, 0.6, 6, dtype=np.float32)
+            picture = np.zeros((4, 4, 3), np.uint8)
+            picture[..., 0] = red
+            values = {"observation.state": state, "observation.images.top": picture}
+            yield Frame(ctx.clock.now_ns(), values), state + shares * (goal + 0.5 * red / 255 - state)
+
+
+class BlindPolicy(SeeingPolicy):
+    def preprocess(self, frame):
+        return {**super().preprocess(frame), "red": np.zeros(1)}
+
+
+class SeesBlueAsRed(SeeingPolicy):
+    def preprocess(self, frame):
+        picture = frame.observation("observation.images.top", (4, 4, 3))
+        return {**super().preprocess(frame), "red": picture[..., 2].mean(keepdims=True)}
+
+
+class ReversesJoints(SeeingPolicy):
+    def postprocess(self, tensors):
+        return super().postprocess(tensors)[:, ::-1].copy()
+
+
+class ReversesTime(SeeingPolicy):
+    def postprocess(self, tensors):
+        return super().postprocess(tensors)[::-1].copy()
+
+
+class ActsInDegrees(SeeingPolicy):
+    def postprocess(self, tensors):
+        return np.degrees(super().postprocess(tensors))
+
+
+class ChunksOfOne(SeeingPolicy):
+    def postprocess(self, tensors):
+        return super().postprocess(tensors)[:1].copy()
+
+
+class OneFingerprintForAll(SeeingPolicy):
+    def weights(self):
+        return "trained" if self.gain else ""
+
+
+class LoadsInItsConstructor(SeeingPolicy):
+    def __init__(self, ctx, trained=0.5):
+        super().__init__(ctx, trained)
+        self.load()
 
 
 class MiscountsItsActions(FakePolicy):
@@ -191,6 +276,14 @@ class NeedsWeightsAtTheEdge(FakePolicy):
 
 
 WRONG = {
+    BlindPolicy: "each_observation_matters",
+    SeesBlueAsRed: "chunks_are_those_of_the_reference",
+    ReversesJoints: "chunks_are_those_of_the_reference",
+    ReversesTime: "chunks_are_those_of_the_reference",
+    ActsInDegrees: "chunks_are_those_of_the_reference",
+    ChunksOfOne: "chunks_have_the_length_of_the_spec",
+    OneFingerprintForAll: "other_policies_have_other_fingerprints",
+    LoadsInItsConstructor: "weights_come_with_load",
     HashesTheObject: "weights_have_one_hash",
     TellsItsStory: "its_identity_is_a_short_text",
     AnswersABatchFromOneArray: "a_batch_is_as_good_as_one_by_one",
