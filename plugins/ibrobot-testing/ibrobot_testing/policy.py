@@ -29,7 +29,7 @@ class PolicySuite(Suite[Policy]):
     def reference(self, ctx: Context) -> Iterator[tuple[Frame, NDArray[np.float64]]]:
         """Frames, and the chunks for them after `reset(0)` by another implementation, e.g. that of the training.
 
-        Override it: colours in another order, degrees and reversed joints differ from it, and from nothing else.
+        Override it: colours in another order, degrees and reversed joints differ from it alone.
         """
         pytest.skip("override reference to have chunks compared with those of the original")
 
