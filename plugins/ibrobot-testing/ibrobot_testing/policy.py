@@ -31,7 +31,7 @@ class PolicySuite(Suite[Policy]):
 
         Override it: colours in another order, degrees and reversed joints differ from it alone.
         """
-        pytest.skip("override reference to have chunks compared with those of the original")
+        pytest.skip("override reference to have chunks compared with the original's")
 
     def another(self, ctx: Context) -> Policy:
         """A policy with other weights or statistics; override it to have `fingerprint` and `weights` checked."""
