@@ -94,7 +94,8 @@ class Recording:
 
 
 @pytest.fixture
-def session() -> Iterator[Callable[[], Recording]]:
+def session(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], Recording]]:
+    monkeypatch.setattr(beside, "_PATIENCE_S", 120.0)
     made: list[Recording] = []
 
     def start() -> Recording:
@@ -205,11 +206,10 @@ def test_a_session_that_dies_leaves_what_an_interrupted_conversion_leaves(sessio
     run.episode()
     run.beside.finish()
     shutil.rmtree("set")
-    order = {
-        "options": {"episodes": ["kept/pick/episodes/episode_000001"], "out": "set", "append": True, "type_": "json"}
-    }
+    order = {"options": {"episodes": ["kept/pick"], "out": "set", "append": True, "type_": "json"}}
     child = Child("ibrobot_data.beside", order, end_s=60.0)
     child.channel.send({"paused": True})
+    child.channel.send({"episode": "kept/pick/episodes/episode_000001"})
     child.channel.close()
     assert not child.end(), "it ends by itself"
     assert kept() == []
@@ -255,7 +255,7 @@ class Process:
         self.made.append(self)
         self.channel = self
         self.sent: list[Any] = []
-        self.episode = order["options"]["episodes"][0]
+        self.order = order
         self.send, self.kill, self.close = self.sent.append, lambda: None, lambda: None
         self.end = lambda: True
 
@@ -276,23 +276,60 @@ def test_a_conversion_makes_room_for_a_recording_that_needs_the_machine(
     converts = ConversionBeside(options, service, logging.getLogger("ibrobot.data"))
     converts.step()
     (process,) = Process.made
+    assert process.sent == [{"episode": "episode_000001"}]
     service.running = True
     converts.step()
-    assert process.sent == []
+    assert process.sent[1:] == []
     vars(status).update(need)
     converts.step()
-    assert process.sent == [{"paused": True}]
+    assert process.sent[1:] == [{"paused": True}]
     service.running = False
     converts.step()
-    assert process.sent == [{"paused": True}, {"paused": False}]
+    assert process.sent[1:] == [{"paused": True}, {"paused": False}]
     vars(status).update(lost={}, waiting_bytes=0)
     service.running = True
     converts.step()
-    assert process.sent[2:] == [{"paused": True}], "the next recording needs it, too"
+    assert process.sent[3:] == [{"paused": True}], "the next recording needs it, too"
     service.running = False
     service.writing = True
     converts.step()
-    assert process.sent[3:] == []
+    assert process.sent[4:] == []
+
+
+def test_a_process_is_ready_when_the_episode_ends(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(beside, "Child", Process)
+    monkeypatch.setattr(Process, "made", [])
+    status = SimpleNamespace(lost={}, waiting_bytes=0)
+    service: Any = SimpleNamespace(written=[], replaced=None, running=False, writing=False, status=lambda: status)
+    options = Convert(episodes=(Path("kept"),), out=Path("set"), append=True)
+    converts = ConversionBeside(options, service, logging.getLogger("ibrobot.data"))
+    converts.step()
+    assert Process.made == [], "nothing is recorded"
+    service.running = True
+    converts.step()
+    converts.step()
+    (process,) = Process.made
+    assert process.sent == []
+    service.running = False
+    service.written = [WrittenEpisode(Path("episode_000001"), "success", "success", whole=True)]
+    converts.step()
+    assert Process.made == [process]
+    assert process.sent == [{"episode": "episode_000001"}]
+
+
+def test_the_end_of_a_session_does_not_wait_for_a_starved_process(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(beside, "Child", Process)
+    monkeypatch.setattr(Process, "made", [])
+    times = iter(range(100))
+    monkeypatch.setattr(beside.time, "monotonic", lambda: float(next(times)))
+    first = WrittenEpisode(Path("episode_000001"), "success", "success", whole=True)
+    service: Any = SimpleNamespace(written=[first], replaced=None, running=False, writing=False)
+    options = Convert(episodes=(Path("kept"),), out=Path("set"), append=True)
+    converts = ConversionBeside(options, service, logging.getLogger("ibrobot.data"))
+    converts.step()
+    converts.finish()
+    assert 3 < next(times) < 30
+    assert converts.row() == "0 episodes converted for set", "the conversion at the end of the session takes it"
 
 
 @pytest.mark.parametrize(
