@@ -38,7 +38,8 @@ from ibrobot_core.api import (
     Robot,
 )
 from ibrobot_core.app import TASK_KEY, DiskFull, installed_plugins
-from ibrobot_data.commanders import Commanders, stretches
+from ibrobot_data.commanders import Commanders, is_labelled, stretches
+from ibrobot_data.growing import GrowingEpisode
 from ibrobot_data.identity import identity
 from ibrobot_data.options import OPERATOR, POLICY
 from ibrobot_data.request import ConversionRequest, EpisodeReport
@@ -146,12 +147,23 @@ def read_unit(path: Path) -> Unit | None:
     return Unit(path, report=EpisodeReport(**record.pop("report")), features=features, **record)
 
 
-def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
+@attrs.frozen
+class _Ended:
+    """What is known of an episode once it has ended."""
+
+    key: str
+    """See `unit_key`."""
+    summary: EpisodeSummary
+    report: EpisodeReport
+
+
+def convert_episode(job: Job, progress: Callable[[int], None], growing: GrowingEpisode | None = None) -> EpisodeReport:
     """Convert an episode into its unit. After a fault, the report has the error and no files remain.
 
     Args:
         job: the episode and its unit.
         progress: called with the number of frames done since the last call.
+        growing: the episode, if it is still being recorded.
 
     Raises:
         DiskFull: if the disk of the unit is full.
@@ -161,24 +173,53 @@ def convert_episode(job: Job, progress: Callable[[int], None]) -> EpisodeReport:
     report = EpisodeReport(job.source)
     try:
         with ExitStack() as stack:
-            if EpisodeAddress.of(job.episode).number is None:
-                stack.enter_context(Ownership(job.episode, "is being converted", shared=True))
-            key = unit_key(job)
-            reader = stack.enter_context(closing(installed_plugins().open_episode(job.episode)))
-            summary = reader.summary()
-            if unwanted := unwanted_outcome(summary, job.request):  # it was marked meanwhile
-                return attrs.evolve(report, outcome=summary.outcome, passed_over=unwanted)
-            report = attrs.evolve(_described(report, summary, job.request), identity=identity(reader, summary))
-            unit = _write(job, key, reader, summary, report, making, progress)
+            if growing is None:
+                reader, ended = _open(job, stack)
+                if unwanted := unwanted_outcome(ended.summary, job.request):  # it was marked meanwhile
+                    return attrs.evolve(report, outcome=ended.summary.outcome, passed_over=unwanted)
+                report = ended.report
+                unit = _write(job, reader, ended.summary, lambda: ended, making, progress)
+            else:
+                begun = growing.summary()
+                unit = _write(job, growing, begun, lambda: _end(job, stack, begun), making, progress)
             if unit is None:
                 return attrs.evolve(report, passed_over=_NOTHING[job.request.only])
             _sync(making)
-            _put(making, job.unit, key)
+            _put(making, job.unit, unit.key)
     except Exception as error:  # noqa: BLE001 - a fault in a plugin must not cost the other episodes
         shutil.rmtree(making, ignore_errors=True)
         stop_if_full(error, job.source)
         return attrs.evolve(report, error=error_text(error))
     return unit.report
+
+
+def _open(job: Job, stack: ExitStack) -> tuple[EpisodeReader, _Ended]:
+    """Open an episode that has ended, and keep others from changing it, until `stack` is left."""
+    if EpisodeAddress.of(job.episode).number is None:
+        stack.enter_context(Ownership(job.episode, "is being converted", shared=True))
+    key = unit_key(job)
+    reader = stack.enter_context(closing(installed_plugins().open_episode(job.episode)))
+    summary = reader.summary()
+    report = attrs.evolve(
+        _described(EpisodeReport(job.source), summary, job.request), identity=identity(reader, summary)
+    )
+    return reader, _Ended(key, summary, report)
+
+
+def _end(job: Job, stack: ExitStack, begun: EpisodeSummary) -> _Ended:
+    """What is known of an episode at its end, after checks that it began as its unit says.
+
+    Raises:
+        DatasetError: if not.
+    """
+    _, ended = _open(job, stack)
+    summary = ended.summary
+    known = {name: summary.metadata.get(name) for name in begun.metadata}
+    if not summary.finished or summary.start_ns != begun.start_ns or known != dict(begun.metadata):
+        raise DatasetError(f"{job.source}: is not the episode that was followed")
+    if is_labelled(summary) != is_labelled(begun):
+        raise DatasetError(f"{job.source}: who commands was recorded later than its first messages")
+    return ended
 
 
 def _put(making: Path, unit: Path, key: str) -> None:
@@ -223,12 +264,23 @@ def error_text(error: Exception) -> str:
     return f"{type(error).__name__}: {error} (at {where}): a fault in ibrobot or a plugin; please report it"
 
 
+def _prompt(summary: EpisodeSummary, request: ConversionRequest) -> str:
+    return summary.metadata.get("prompt") or request.prompt
+
+
 def _described(report: EpisodeReport, summary: EpisodeSummary, request: ConversionRequest) -> EpisodeReport:
+    """A report with what the summary says.
+
+    Raises:
+        DatasetError: if the request needs an outcome that the episode does not have.
+    """
+    if request.success and summary.outcome == "unknown" and not unwanted_outcome(summary, request):
+        raise DatasetError(f"{SUCCESS} cannot be determined: the episode's outcome is unknown")
     return attrs.evolve(
         report,
         finished=summary.finished,
         outcome=summary.outcome,
-        prompt=summary.metadata.get("prompt") or request.prompt,
+        prompt=_prompt(summary, request),
         start_ns=summary.start_ns,
         lost={topic: each.dropped for topic, each in summary.topics.items() if each.dropped},
         missing={topic: each.missing for topic, each in summary.topics.items() if each.missing},
@@ -236,21 +288,29 @@ def _described(report: EpisodeReport, summary: EpisodeSummary, request: Conversi
 
 
 def _write(
-    job: Job, key: str, reader: EpisodeReader, summary: EpisodeSummary, report: EpisodeReport, folder: Path,
+    job: Job, reader: EpisodeReader, begun: EpisodeSummary, end: Callable[[], _Ended], folder: Path,
     progress: Callable[[int], None],
 ) -> Unit | None:  # fmt: skip
-    """Write the dataset of one episode and the record of the unit; returns None if no row is wanted."""
+    """Write the dataset of one episode and the record of the unit; returns None if no row is wanted.
+
+    Args:
+        job: the episode and its unit.
+        reader: the episode.
+        begun: its summary, as far as it is known before its messages are read.
+        end: what is known after that.
+        folder: that of the unit, until it is complete.
+        progress: see `convert_episode`.
+    """
     request = job.request
-    contract = _contract(request, summary)
-    document = request.document or _recorded(summary, "config")
-    recorded = _joined(_recorded(summary, "calibration"))
+    contract = _contract(request, begun)
+    document = request.document or _recorded(begun, "config")
+    recorded = _joined(_recorded(begun, "calibration"))
     calibration = recorded if request.calibration is None else _completed(request.calibration, recorded)
     units = policy_units(contract)(request.norm_mode, contract, calibration, document)
-    robot_type = (document.get("robot") or {}).get("robot_type") or summary.metadata.get("robot_type", "")
-    if request.success and report.outcome == "unknown":
-        raise DatasetError(f"{SUCCESS} cannot be determined: the episode's outcome is unknown")
+    robot_type = (document.get("robot") or {}).get("robot_type") or begun.metadata.get("robot_type", "")
+    prompt = _prompt(begun, request)
     ticks = Ticks(reader, contract, request.missing)
-    commanders = Commanders(reader, summary) if request.labels or request.only != "all" else None
+    commanders = Commanders(reader, begun) if request.labels or request.only != "all" else None
     writer = make_writer(request)
     features: dict[str, Feature] = {}
     waiting: _Row | None = None
@@ -259,7 +319,7 @@ def _write(
 
     def rows() -> Iterator[_Row]:
         for row in ticks:
-            values, task = _labelled(units(row), contract, ticks.tasks, report.prompt)
+            values, task = _labelled(units(row), contract, ticks.tasks, prompt)
             commander = commanders.at(ticks.stamp_ns) if commanders is not None else ""
             yield _Row(values, task, commander)
             progress(1)
@@ -283,18 +343,19 @@ def _write(
             tasks.setdefault(row.task)
         if waiting is None:
             return None
-        succeeds = report.outcome == "success" and number == ticks.rows - 1
+        ended = end()
+        succeeds = ended.report.outcome == "success" and number == ticks.rows - 1
         _add(writer, waiting, request, features, last=True, succeeds=succeeds and _has_end(ticks, request))
         writer.save_episode()
     finally:
         writer.finalize()
     report = attrs.evolve(
-        report, frames=sum(count for _, count in pieces), stretches=pieces, skipped=ticks.skipped,
+        ended.report, frames=sum(count for _, count in pieces), stretches=pieces, skipped=ticks.skipped,
         cuts=tuple(ticks.cuts), held=ticks.held, gaps=dict(ticks.gaps), resets=ticks.resets, prompt="; ".join(tasks),
     )  # fmt: skip
     unit = Unit(
-        job.unit, key, report, contract.rate_hz, features, contract.canonical(), robot_type, calibration, document,
-        summary.metadata,
+        job.unit, ended.key, report, contract.rate_hz, features, contract.canonical(), robot_type, calibration,
+        document, ended.summary.metadata,
     )  # fmt: skip
     record = {name: value for name, value in attrs.asdict(unit).items() if name != "path"}
     (folder / _RECORD).write_text(json.dumps(record, indent=2), encoding="utf-8")

@@ -229,6 +229,11 @@ class EpisodeService(Episodes):
         return self._recording.written
 
     @property
+    def present(self) -> Path | None:
+        """The folder of the episode that is being recorded or written; None without one."""
+        return self._recording.present
+
+    @property
     def replaced(self) -> Path | None:
         """The folder of the episode that is being recorded again; None without one."""
         return self._recording.replaced

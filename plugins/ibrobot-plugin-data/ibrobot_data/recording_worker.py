@@ -257,6 +257,12 @@ class RecordingWorker(SessionWorker):
         return self._ending > 0
 
     @property
+    def present(self) -> Path | None:
+        """The folder of the episode that is being recorded or written; None without one."""
+        owned = self._owned
+        return owned.path if owned is not None else None
+
+    @property
     def saved(self) -> int:
         """Number of episodes kept, including those still being written; incomplete ones are subtracted later."""
         with self._pending_lock:

@@ -19,7 +19,7 @@ from ibrobot_provenance.jobs import Job as PoolJob
 from ibrobot_provenance.jobs import Pool, open_pool
 from ibrobot_provenance.ownership import Ownership
 
-from ibrobot_core.api import Contract, DatasetError, EpisodeAddress, IbrobotError, seconds
+from ibrobot_core.api import Contract, DatasetError, EpisodeAddress, IbrobotError, RecorderError, seconds
 from ibrobot_core.app import DiskFull, installed_plugins, set_malloc
 from ibrobot_data.commanders import is_labelled
 from ibrobot_data.episode import (
@@ -31,9 +31,11 @@ from ibrobot_data.episode import (
     error_text,
     make_writer,
     read_unit,
+    recorded_contract,
     unit_key,
     unwanted_outcome,
 )
+from ibrobot_data.growing import GrowingEpisode
 from ibrobot_data.identity import KnownEpisodes, identity, identity_by_uuid
 from ibrobot_data.provenance import conversion, provenance
 from ibrobot_data.request import ConversionRequest, EpisodeReport, Report
@@ -129,6 +131,57 @@ def stage(request: ConversionRequest, episode: Path, progress: Callable[[int], N
     with _staging(request) as (whole, staging, old):
         plan = _Plan(whole, staging, old, [episode])
         return next((convert_episode(job, progress) for job in plan.unfinished(plan.todo)), None)
+
+
+def follow(
+    request: ConversionRequest, episode: Path, progress: Callable[[int], None], has_ended: Callable[[float], bool]
+) -> EpisodeReport | None:
+    """Convert an episode while it is being recorded, and keep it as `stage` does; the result is the same.
+
+    An episode that cannot be followed, e.g. because it records who commands, is converted once it has ended.
+
+    Args:
+        request: as of `stage`.
+        episode: the episode's folder.
+        progress: called with the number of frames done since the last call.
+        has_ended: see `GrowingEpisode`.
+
+    Raises:
+        DatasetError: as `convert`.
+        DiskFull: as `convert`.
+        InUse: if another conversion into the dataset is running.
+    """
+    set_malloc(_MAP_FROM, _KEEP)
+    growing = GrowingEpisode(episode, has_ended)
+    with _staging(request) as (whole, staging, old):
+        if whole.only == "all" and not whole.labels and _has_begun(growing, whole):
+            job = Job(whole, episode, _source(episode, ()), staging / _unit_of(episode))
+            shutil.rmtree(job.unit, ignore_errors=True)
+            if not (report := convert_episode(job, progress, growing)).error:
+                return report
+        while not growing.ended:
+            growing.wait()
+        plan = _Plan(whole, staging, old, [episode])
+        return next((convert_episode(job, progress) for job in plan.unfinished(plan.todo)), None)
+
+
+def _has_begun(growing: GrowingEpisode, request: ConversionRequest) -> bool:
+    """Wait for a message of every topic that is needed; false if there is none, or the episode cannot be followed."""
+    while not growing.ended:
+        begin_s = time.monotonic()
+        with suppress(RecorderError):  # nothing is on the disk yet
+            summary = growing.summary()
+            contract = request.contract or recorded_contract(summary.metadata)
+            counted = {topic for topic, each in summary.topics.items() if each.count}
+            if contract is not None and counted.issuperset(contract.topics):
+                return not is_labelled(summary)
+        growing.wait(time.monotonic() - begin_s)
+    return False
+
+
+def _unit_of(episode: Path) -> str:
+    """Name of an episode's unit."""
+    return hashlib.sha256(os.fsencode(episode.resolve())).hexdigest()[:32]
 
 
 def check_out(request: ConversionRequest) -> None:
@@ -257,8 +310,7 @@ class _Plan:
         for path in episodes:
             source = _source(path, self.sources)
             self.sources[source] = None
-            unit = hashlib.sha256(os.fsencode(path.resolve())).hexdigest()[:32]
-            self._add(Job(request, path, source, staging / unit), known)
+            self._add(Job(request, path, source, staging / _unit_of(path)), known)
         if old is None and self._labelled:
             self.request = attrs.evolve(request, labels=True)
             self._jobs = {source: attrs.evolve(job, request=self.request) for source, job in self._jobs.items()}

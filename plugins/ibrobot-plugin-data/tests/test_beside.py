@@ -15,7 +15,7 @@ import attrs
 import pytest
 from command_line import run_here
 from ibrobot_data import beside
-from ibrobot_data.beside import ConversionBeside
+from ibrobot_data.beside import ConversionBeside, Orders
 from ibrobot_data.command import Convert
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.operator import Operator
@@ -193,7 +193,7 @@ def test_an_episode_that_is_recorded_again_is_left_to_its_deletion(session: Call
     assert "episode_000001 follows" in dict(run.operator.rows())["dataset"]
     assert run.operator.key("backspace")
     run.step()
-    assert "follows" not in dict(run.operator.rows())["dataset"]
+    assert "episode_000001" not in dict(run.operator.rows())["dataset"]
     run.operator.key("tab")
     run.step()
     run.beside.finish()
@@ -206,10 +206,9 @@ def test_a_session_that_dies_leaves_what_an_interrupted_conversion_leaves(sessio
     run.episode()
     run.beside.finish()
     shutil.rmtree("set")
-    order = {"options": {"episodes": ["kept/pick"], "out": "set", "append": True, "type_": "json"}}
-    child = Child("ibrobot_data.beside", order, end_s=60.0)
+    options = {"episodes": ["kept/pick/episodes/episode_000001"], "out": "set", "append": True, "type_": "json"}
+    child = Child("ibrobot_data.beside", {"options": options, "growing": False}, end_s=60.0)
     child.channel.send({"paused": True})
-    child.channel.send({"episode": "kept/pick/episodes/episode_000001"})
     child.channel.close()
     assert not child.end(), "it ends by itself"
     assert kept() == []
@@ -218,32 +217,40 @@ def test_a_session_that_dies_leaves_what_an_interrupted_conversion_leaves(sessio
 
 
 class Messages:
-    """A channel on which each call of `receive` gets the next of these messages, if it may wait for them."""
+    """A channel on which each call of `receive` gets the next of these lists of messages."""
 
     closed = False
 
-    def __init__(self, *messages: bool | None) -> None:
+    def __init__(self, *messages: list[dict[str, bool]]) -> None:
         self.messages = list(messages)
         self.waits: list[float | None] = []
 
     def receive(self, timeout_s: float | None = 0.0) -> list[dict[str, bool]]:
         self.waits.append(timeout_s)
-        paused = self.messages.pop(0)
-        return [] if paused is None else [{"paused": paused}]
+        return self.messages.pop(0)
 
 
 def test_a_conversion_waits_until_it_may_go_on():
-    channel: Any = Messages(None, True, None, False, None)
-    wait = beside.gate(channel)
-    wait(1)
+    channel: Any = Messages([], [{"paused": True}], [], [{"paused": False}], [])
+    orders = Orders(channel)
+    orders.pass_on(1)
     assert channel.waits == [0.0]
-    wait(1)
+    orders.pass_on(1)
     assert channel.waits == [0.0, 0.0, None, None]
-    wait(1)
+    orders.pass_on(1)
     assert channel.waits == [0.0, 0.0, None, None, 0.0]
-    channel.closed, channel.messages = True, [None]
+    channel.closed, channel.messages = True, [[]]
     with pytest.raises(ComponentFailed, match="the session has ended"):
-        wait(1)
+        orders.pass_on(1)
+
+
+def test_a_conversion_learns_of_the_end_of_its_recording_even_while_it_waits():
+    channel: Any = Messages([], [{"paused": True}], [{"ended": True}], [{"paused": False}])
+    orders = Orders(channel, growing=True)
+    assert not orders.has_ended(0.5)
+    orders.pass_on(1)
+    assert orders.has_ended(0.5)
+    assert channel.waits == [0.5, 0.0, None, None]
 
 
 class Process:
@@ -255,7 +262,7 @@ class Process:
         self.made.append(self)
         self.channel = self
         self.sent: list[Any] = []
-        self.order = order
+        self.episode, self.growing = order["options"]["episodes"][0], order["growing"]
         self.send, self.kill, self.close = self.sent.append, lambda: None, lambda: None
         self.end = lambda: True
 
@@ -276,45 +283,79 @@ def test_a_conversion_makes_room_for_a_recording_that_needs_the_machine(
     converts = ConversionBeside(options, service, logging.getLogger("ibrobot.data"))
     converts.step()
     (process,) = Process.made
-    assert process.sent == [{"episode": "episode_000001"}]
     service.running = True
     converts.step()
-    assert process.sent[1:] == []
+    assert process.sent == []
     vars(status).update(need)
     converts.step()
-    assert process.sent[1:] == [{"paused": True}]
+    assert process.sent == [{"paused": True}]
     service.running = False
     converts.step()
-    assert process.sent[1:] == [{"paused": True}, {"paused": False}]
+    assert process.sent == [{"paused": True}, {"paused": False}]
     vars(status).update(lost={}, waiting_bytes=0)
     service.running = True
     converts.step()
-    assert process.sent[3:] == [{"paused": True}], "the next recording needs it, too"
+    assert process.sent[2:] == [{"paused": True}], "the next recording needs it, too"
     service.running = False
     service.writing = True
     converts.step()
-    assert process.sent[4:] == []
+    assert process.sent[3:] == []
 
 
-def test_a_process_is_ready_when_the_episode_ends(monkeypatch: pytest.MonkeyPatch):
+@pytest.fixture
+def present(monkeypatch: pytest.MonkeyPatch) -> tuple[ConversionBeside, Any, Process]:
+    """A conversion that follows `episode_000001`, the service that records it, and the process."""
     monkeypatch.setattr(beside, "Child", Process)
     monkeypatch.setattr(Process, "made", [])
     status = SimpleNamespace(lost={}, waiting_bytes=0)
-    service: Any = SimpleNamespace(written=[], replaced=None, running=False, writing=False, status=lambda: status)
-    options = Convert(episodes=(Path("kept"),), out=Path("set"), append=True)
+    episode = Path("episode_000001")
+    service: Any = SimpleNamespace(
+        written=[], replaced=None, running=True, writing=False, present=None, status=lambda: status
+    )
+    options = Convert(episodes=(Path("kept"),), out=Path("set"), append=True, outcome=("success",))
     converts = ConversionBeside(options, service, logging.getLogger("ibrobot.data"))
     converts.step()
-    assert Process.made == [], "nothing is recorded"
-    service.running = True
+    assert Process.made == [], "it has no folder yet"
+    service.present = episode
     converts.step()
     converts.step()
     (process,) = Process.made
-    assert process.sent == []
-    service.running = False
-    service.written = [WrittenEpisode(Path("episode_000001"), "success", "success", whole=True)]
+    assert (process.episode, process.growing, process.sent) == (str(episode), True, [])
+    return converts, service, process
+
+
+def test_an_episode_is_followed_until_it_is_written(present: tuple[ConversionBeside, Any, Process]):
+    converts, service, process = present
+    service.running, service.writing = False, True
     converts.step()
+    assert process.sent == []
+    service.written = [WrittenEpisode(Path("episode_000001"), "success", "success", whole=True)]
+    service.writing, service.present = False, None
+    converts.step()
+    converts.step()
+    assert process.sent == [{"ended": True}]
     assert Process.made == [process]
-    assert process.sent == [{"episode": "episode_000001"}]
+    assert converts.row() == "0 episodes converted for set; episode_000001 follows"
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        [],
+        [WrittenEpisode(Path("episode_000001"), "success", "success", whole=False)],
+        [WrittenEpisode(Path("episode_000001"), "failure", "failure", whole=True)],
+    ],
+    ids=["discarded", "unfinished", "unwanted"],
+)
+def test_an_episode_that_is_not_wanted_is_followed_no_longer(
+    present: tuple[ConversionBeside, Any, Process], written: list[WrittenEpisode]
+):
+    converts, service, process = present
+    service.running, service.present, service.written = False, None, written
+    converts.step()
+    assert process.sent == []
+    assert converts.row() == "0 episodes converted for set"
+    assert Process.made == [process]
 
 
 def test_the_end_of_a_session_does_not_wait_for_a_starved_process(monkeypatch: pytest.MonkeyPatch):
