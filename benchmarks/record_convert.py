@@ -1,6 +1,6 @@
 """What `ibrobot record --convert` costs, and how long the dataset takes after the last episode.
 
-    python benchmarks/record_convert.py [--episodes 20] [--seconds 15] [--pause 5]
+    python benchmarks/record_convert.py [--episodes 20] [--seconds 15] [--pause 5] [--robot YAML]
 
 The simulated SO-101 with two rendered 640x480 cameras at 30 Hz, in real time, in one run: a session (a) without and
 (b) with `--convert`, each in processes of its own, with pauses in which somebody would reset the scene. Then `ibrobot
@@ -43,7 +43,7 @@ class Session:
 def record(folder: Path, asked: argparse.Namespace, *more: str) -> Session:
     """Record a session in a folder."""
     command = [
-        *IBROBOT, "record", "so101", "--sim", "--mode", "still", "--headless", "--auto", "--prompt", "pick", "--events",
+        *IBROBOT, "record", asked.robot, "--sim", "--mode", "still", "--headless", "--auto", "--prompt", "pick", "--events",
         "--json", "--set=control_modes.still={executors: [arm_position, gripper_position]}",
         f"--episodes={asked.episodes}", f"--reset-time={asked.pause}",
         f"--set=contract.max_duration_s={asked.seconds}", *more,
@@ -88,7 +88,9 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=15.0, help="of each episode")
     parser.add_argument("--pause", type=float, default=5.0, help="after each episode [s]")
+    parser.add_argument("--robot", default="so101", help="robot YAML with the cameras top and wrist")
     asked = parser.parse_args()
+    asked.robot = str(Path(asked.robot).resolve()) if Path(asked.robot).is_file() else asked.robot
     with tempfile.TemporaryDirectory() as made:
         without, beside = Path(made) / "without", Path(made) / "beside"
         for folder in (without, beside):

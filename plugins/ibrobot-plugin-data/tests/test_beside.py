@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import random
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,12 +17,16 @@ import pytest
 from command_line import run_here
 from ibrobot_data import beside
 from ibrobot_data.beside import ConversionBeside, Orders
-from ibrobot_data.command import Convert
+from ibrobot_data.command import Convert, conversion_request
 from ibrobot_data.episode_service import EpisodeService
+from ibrobot_data.growing import GrowingEpisode
 from ibrobot_data.operator import Operator
+from ibrobot_data.options import COMMANDER
+from ibrobot_data.run import follow, stage
 from ibrobot_data.written import WrittenEpisode
 from ibrobot_testing.site import made_up_site
 
+from ibrobot_core.api import RecorderError, String
 from ibrobot_core.app import Child, ComponentFailed, LaunchRequest, Runtime, Session, installed_plugins, load_config
 
 pytestmark = pytest.mark.usefixtures("fork_server")
@@ -387,3 +392,103 @@ def test_unfinished_and_unwanted_episodes_are_not_converted(monkeypatch: pytest.
     options = Convert(episodes=(Path("kept"),), out=Path("set"), append=True, outcome=("success",))
     ConversionBeside(options, service, logging.getLogger("ibrobot.data")).step()
     assert Process.made == []
+
+
+EPISODE = Path("kept/pick/episodes/episode_000001")
+
+
+class Growing:
+    """A recorded episode that grows in another folder, by some messages each time it is asked whether it has ended."""
+
+    def __init__(self, parts: list[int]) -> None:
+        self.episode = Path("grown/pick/episodes/episode_000001")
+        shutil.rmtree("grown", ignore_errors=True)
+        shutil.copytree(EPISODE, self.episode)
+        self.found: dict[str, Any] = json.loads((EPISODE / "episode.json").read_text())
+        self.messages: list[Any] = self.found["messages"]
+        self.parts: list[int | None] = [*parts, None]
+        self.left = -1
+        self.has_ended(0.0)
+
+    def has_ended(self, timeout_s: float) -> bool:
+        if self.left == 0:
+            return True
+        count = self.parts.pop(0)
+        part = {**self.found, "messages": self.messages[:count]}
+        self.left = len(self.messages) - len(part["messages"])
+        if self.left:
+            part["outcome"] = "unknown"
+        (self.episode / "episode.json").write_text(json.dumps(part))
+        return False
+
+    def unit(self, convert: Callable[..., Any], *more: Any) -> dict[str, Any]:
+        """The unit that a conversion makes, without what depends on times of files."""
+        shutil.rmtree("set", ignore_errors=True)
+        options = Convert(episodes=(self.episode,), out=Path("set"), append=True, type_="json")
+        report = convert(conversion_request(options), self.episode, lambda frames: None, *more)
+        assert report is not None
+        assert not report.error, report.error
+        (unit,) = Path("set/.staging").glob("*/")
+        record = json.loads((unit / "episode.json").read_text())
+        return {**record, "key": "", "dataset": (unit / "dataset/dataset.json").read_text()}
+
+
+@pytest.fixture
+def recorded() -> int:
+    """The number of messages of a recorded episode."""
+    assert run_here(*RECORD, "--episodes", 1, "--set", "contract.max_duration_s=2.0").returncode == 0
+    return len(json.loads((EPISODE / "episode.json").read_text())["messages"])
+
+
+def test_an_episode_that_grows_is_converted_as_if_it_were_whole(recorded: int):
+    whole = Growing([]).unit(stage)
+    assert whole["report"]["frames"] > 20
+    for seed in range(30):
+        draw = random.Random(seed)
+        parts = sorted(draw.sample(range(1, recorded), draw.randrange(1, 12)))
+        growing = Growing(parts)
+        assert growing.unit(follow, growing.has_ended) == whole, seed
+        followed = Growing(parts)
+        read = [
+            (each.topic, each.received_ns) for each in GrowingEpisode(followed.episode, followed.has_ended).messages()
+        ]
+        assert read == [(topic, stamp_ns) for topic, stamp_ns, _ in followed.messages], seed
+
+
+def test_messages_that_reach_the_disk_late_are_not_left_out(recorded: int):
+    growing = Growing([1, recorded // 2, recorded // 2 + 6])
+    late = growing.messages.pop(recorded // 4)
+    growing.messages.insert(recorded // 2 + 3, late)
+    with pytest.raises(RecorderError, match=r"messages came, \d+ in order"):
+        list(GrowingEpisode(growing.episode, growing.has_ended).messages())
+
+
+@pytest.mark.parametrize("changed", ["prompt", "start"])
+def test_an_episode_that_is_replaced_meanwhile_is_converted_from_its_beginning(recorded: int, changed: str):
+    growing = Growing([recorded // 2])
+    if changed == "prompt":
+        growing.found = {**growing.found, "metadata": {**growing.found["metadata"], "prompt": "another"}}
+    else:
+        growing.messages.insert(0, [*growing.messages[0][:1], growing.messages[0][1] - 1, growing.messages[0][2]])
+    got = growing.unit(follow, growing.has_ended)
+    assert got == growing.unit(stage)
+
+
+def test_an_episode_that_records_who_commands_is_converted_once_it_has_ended(recorded: int):
+    growing = Growing([recorded // 2, recorded // 2 + 5])
+    stamp_ns = growing.messages[0][1]
+    growing.found["topics"][COMMANDER] = String.ros_type
+    growing.messages.insert(0, [COMMANDER, stamp_ns, "operator"])
+    growing.has_ended(0.0)
+    assert growing.unit(follow, growing.has_ended) == growing.unit(stage)
+
+
+def test_following_ends_with_the_session(recorded: int):
+    growing = Growing([recorded // 2])
+
+    def died(timeout_s: float) -> bool:
+        raise ComponentFailed("the session has ended")
+
+    with pytest.raises(ComponentFailed, match="the session has ended"):
+        growing.unit(follow, died)
+    assert not [path for path in Path("set").rglob("*") if ".making." in path.name]
