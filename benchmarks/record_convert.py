@@ -43,8 +43,8 @@ class Session:
 def record(folder: Path, asked: argparse.Namespace, *more: str) -> Session:
     """Record a session in a folder."""
     command = [
-        *IBROBOT, "record", asked.robot, "--sim", "--mode", "still", "--headless", "--auto", "--prompt", "pick", "--events",
-        "--json", "--set=control_modes.still={executors: [arm_position, gripper_position]}",
+        *IBROBOT, "record", asked.robot, "--sim", "--mode", "still", "--headless", "--auto", "--prompt", "pick",
+        "--events", "--json", "--set=control_modes.still={executors: [arm_position, gripper_position]}",
         f"--episodes={asked.episodes}", f"--reset-time={asked.pause}",
         f"--set=contract.max_duration_s={asked.seconds}", *more,
     ]  # fmt: skip
