@@ -94,6 +94,7 @@ def ibrobot_executors() -> Iterable[ExecutorDescriptor]:
 def _world(options: WorldOptions, session: RunView) -> Component:
     ages = [thing.max_age for thing in options.objects.values() if thing.max_age is not None]
     if options.clouds or options.scene or ages:
+        find_engines()
         from ibrobot_planning.world.clouds import SensedWorld
 
         return SensedWorld(options, session)

@@ -30,7 +30,7 @@ from ibrobot_core.api import (
     Vector3,
     ns,
 )
-from ibrobot_core.app import Component, ConfigError, Session, single_options
+from ibrobot_core.app import Component, ConfigError, MissingDependency, Session, single_options
 
 from .table_arm import make_robot
 
@@ -62,6 +62,13 @@ class TestSensedWorld(SectionSuite):
     @override
     def component(self, session: Session) -> Component:
         return SensedWorld(options(), session)
+
+
+def test_a_world_that_is_sensed_names_what_this_machine_lacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("ibrobot_planning.world.engines.find_spec", lambda name: None)
+    world = next(each for each in ibrobot_sections() if each.type == "world")
+    with pytest.raises(MissingDependency, match=r'pip install "ibrobot-plugin-planning\[obstacles\]"'):
+        world.make(options(), session_of(tmp_path, monkeypatch))
 
 
 def cloud(points: Any, frame: str = "lidar") -> PointCloud2:

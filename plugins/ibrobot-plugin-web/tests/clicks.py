@@ -1,0 +1,244 @@
+"""The whole way on the page of `ibrobot ui`: from a robot's YAML to a policy that was trained, evaluated and launched.
+
+    npm pack axe-core && tar xzf axe-core-*.tgz
+    python plugins/ibrobot-plugin-web/tests/clicks.py FOLDER --axe package/axe.min.js [--keyboard] [--episodes 10]
+
+Counts the fewest clicks, keys and characters of each stage; with `--keyboard` the pointer is never used, and the tabs to
+each place are counted. Writes pictures of each screen, as `look.py` does, and then of every view and of the pages of the
+runs in Chinese, and prints what axe-core finds serious or critical. Needs Chromium, playwright and LeRobot.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import look
+from look import Look, browser, view
+
+sys.path.insert(0, str(Path(__file__).parents[3] / "tests/shared"))
+from ui_path import own_robot, press, ui_process, until
+
+_WAIT_MS = 90_000
+_TABS = 150
+"""Most tabs to a place."""
+
+
+class Hand:
+    """What a person does with a pointer and a keyboard, counted."""
+
+    def __init__(self) -> None:
+        self.clicks = self.keys = self.characters = self.tabs = 0
+
+    def press(self, element: Any) -> None:
+        """Press a button or follow a link."""
+        element.click(timeout=_WAIT_MS)
+        self.clicks += 1
+
+    def type(self, element: Any, text: str) -> None:
+        """Type into a field that is empty."""
+        element.click()
+        self.clicks += 1
+        element.fill(text)
+        self.characters += len(text)
+
+    def key(self, page: Any, key: str) -> None:
+        """Press a key."""
+        page.keyboard.press(key)
+        self.keys += 1
+
+    def hold(self, page: Any, label: str, expression: str) -> None:
+        """Hold a button until an expression is true."""
+        press(page, label, expression)
+        page.mouse.up()
+        self.clicks += 1
+
+    def total(self) -> dict[str, int]:
+        """The counts."""
+        return dict(vars(self))
+
+
+class Keyboard(Hand):
+    """A person without a pointer."""
+
+    def press(self, element: Any) -> None:
+        self._reach(element)
+        element.page.keyboard.press("Enter")
+        self.keys += 1
+
+    def type(self, element: Any, text: str) -> None:
+        self._reach(element)
+        element.page.keyboard.type(text)
+        self.characters += len(text)
+
+    def hold(self, page: Any, label: str, expression: str) -> None:
+        self._reach(page.get_by_label(label))
+        while not page.evaluate(f"Boolean({expression})"):  # a page that stalls releases it
+            page.keyboard.down("Enter")
+            page.wait_for_timeout(3000)
+            page.keyboard.up("Enter")
+        self.keys += 1
+
+    def _reach(self, element: Any) -> None:
+        """Go to an element by the tab key."""
+        page = element.page
+        element.wait_for(timeout=_WAIT_MS)
+        for _ in range(_TABS):
+            if element.evaluate("each => each === document.activeElement"):
+                shown = element.evaluate("each => each.matches(':focus-visible')")
+                assert shown, f"{element}: the focus is not visible"
+                return
+            page.keyboard.press("Tab")
+            self.tabs += 1
+        raise AssertionError(f"{element}: not reached by {_TABS} tabs")
+
+
+def stages(hand: Hand, page: Any, look_at: Any, episodes: int) -> Any:
+    """Walk the way; yields the name of each stage that is done."""
+    nav = page.locator("#nav")
+    main = page.locator("#main")
+    look_at(page, "way-01-first")
+    hand.press(nav.get_by_role("link", name="Record", exact=True))
+    hand.type(page.get_by_label("Task"), "pick the cube")
+    hand.type(page.get_by_label("Episodes", exact=True), str(episodes))
+    look_at(page, "way-02-record")
+    start = page.get_by_role("button", name="Start the session")
+    with page.context.expect_page(timeout=_WAIT_MS) as opened:
+        hand.press(start)
+    run = opened.value
+    run.wait_for_url(re.compile("^http"), wait_until="commit", timeout=_WAIT_MS)
+    until(run, "window.ibrobot?.jogs.length && ibrobot.status.episode")
+    yield "choose the robot, begin to record"
+
+    look_at(run, "way-03-run")
+    for number in range(episodes):
+        joint, index = (("shoulder_pan", 0), ("wrist_roll", 4))[number % 2]
+        way = ("up", "down")[number // 2 % 2]
+        hand.key(run, "b")
+        before = run.evaluate("ibrobot.state.position")[index]
+        moved = f"ibrobot.status.episode.elapsed_s > 1 && Math.abs(ibrobot.state.position[{index}] - {before}) > 0.2"
+        hand.hold(run, f"{joint} {way}, hold to move", moved)
+        if number == 0:
+            look_at(run, "way-04-episode")
+        hand.key(run, "s")
+        until(run, f"ibrobot.status.episode.saved === {number + 1}")
+    look_at(run, "way-05-saved")
+    until(run, "ibrobot.status.ended")
+    look_at(run, "way-06-ended")
+    page.bring_to_front()
+    page.locator(".job .state.done").first.wait_for(timeout=_WAIT_MS)
+    yield f"record and judge {episodes} episodes"
+
+    look_at(page, "way-07-session")
+    hand.press(page.locator(".job").get_by_role("link", name="Convert", exact=True))
+    until(page, "document.querySelector('#field-out')?.value")
+    look_at(page, "way-08-convert")
+    hand.press(main.get_by_role("button", name="Convert", exact=True))
+    page.get_by_role("link", name="Open the dataset").wait_for(timeout=_WAIT_MS)
+    yield "convert"
+
+    look_at(page, "way-09-converted")
+    hand.press(page.locator(".job:visible").get_by_role("link", name="Train", exact=True))
+    page.get_by_label("Steps", exact=True).wait_for()
+    until(page, "!document.querySelector('#view-job-train form button.primary').disabled")
+    if (steps := page.get_by_label("Steps", exact=True)).input_value():
+        steps.fill("")
+    hand.type(steps, "50")
+    look_at(page, "way-10-train")
+    hand.press(main.get_by_role("button", name="Train", exact=True))
+    page.locator(".job:visible .state.running").first.wait_for(timeout=_WAIT_MS)
+    page.wait_for_timeout(5000)
+    look_at(page, "way-11-training")
+    page.get_by_role("link", name="Use it in a robot").wait_for(timeout=4 * _WAIT_MS)
+    yield "train 50 steps"
+
+    look_at(page, "way-12-trained")
+    hand.press(page.get_by_role("link", name="Use it in a robot"))
+    page.get_by_role("button", name="Write the").wait_for(timeout=_WAIT_MS)
+    look_at(page, "way-13-change")
+    hand.press(page.get_by_role("button", name="Write the"))
+    launch = page.get_by_role("button", name="Launch it in simulation")
+    launch.wait_for()
+    look_at(page, "way-14-written")
+    with page.context.expect_page(timeout=_WAIT_MS) as opened:
+        hand.press(launch)
+    trained = opened.value
+    trained.wait_for_url(re.compile("^http"), wait_until="commit", timeout=_WAIT_MS)
+    until(trained, "(window.ibrobot?.status?.counts.dispatch?.plan_length ?? 0) > 0")
+    yield "launch the policy"
+
+    look_at(trained, "way-15-runs")
+    page.bring_to_front()
+    look_at(page, "way-16-running")
+    view(page, "jobs")
+    page.get_by_role("button", name="Stop the run").first.click()
+    page.locator(".job .state.running").wait_for(state="hidden", timeout=_WAIT_MS)
+    trained.close()
+    view(page, "job-train")
+    hand.press(page.locator(".job:visible").get_by_role("link", name="Evaluate", exact=True))
+    main.get_by_role("button", name="Evaluate", exact=True).wait_for()
+    page.wait_for_timeout(1500)
+    look_at(page, "way-17-evaluate")
+    hand.type(page.locator("#field-episodes"), "2")
+    hand.press(main.get_by_role("button", name="Evaluate", exact=True))
+    page.locator(".job:visible .state.done").first.wait_for(timeout=4 * _WAIT_MS)
+    look_at(page, "way-18-evaluated")
+    hand.press(page.locator(".job:visible").get_by_role("link", name=re.compile("Results")).first)
+    page.wait_for_timeout(3000)
+    look_at(page, "way-19-results")
+    yield "evaluate the policy"
+
+
+def main() -> None:
+    """Walk, count and look."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path, help="for the pictures")
+    parser.add_argument("--axe", type=Path, help="axe.min.js; without it nothing is checked")
+    parser.add_argument("--keyboard", action="store_true", help="without a pointer")
+    parser.add_argument("--episodes", type=int, default=10)
+    parser.add_argument("--no-pictures", action="store_true", help="only count")
+    chosen = parser.parse_args()
+    for size in ("zoom", "wide"):
+        del look.SIZES[size]
+    eye = Look(chosen.folder, chosen.axe.read_text(encoding="utf-8") if chosen.axe is not None else "")
+    look_at = (lambda page, name: None) if chosen.no_pictures else eye
+    hand = Keyboard() if chosen.keyboard else Hand()
+    begin_s, before, problems = time.monotonic(), hand.total(), list[str]()
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        own_robot(folder)
+        own = folder / "my_arm.yaml"  # looking at an episode takes longer than 20 s
+        own.write_text(own.read_text(encoding="utf-8").replace("max_duration_s: 20", "max_duration_s: 900"), "utf-8")
+        with ui_process(folder) as address, browser() as chromium:
+            page = look.opened(chromium, address)
+            page.context.set_default_timeout(_WAIT_MS)
+            page.on("pageerror", lambda error: problems.append(str(error)))
+            page.get_by_text("No problems found.").wait_for()
+            try:
+                for stage in stages(hand, page, look_at, chosen.episodes):
+                    now = hand.total()
+                    counts = {name: now[name] - before[name] for name in now}
+                    print(stage, counts, f"{time.monotonic() - begin_s:.0f} s", flush=True)
+                    before = now
+            except BaseException:
+                page.screenshot(path=chosen.folder / "failed.png", full_page=True)
+                raise
+            if not chosen.no_pictures:
+                for language in ("en", "zh-CN"):
+                    look.LANGUAGE[0] = language
+                    other = look.opened(chromium, address)
+                    until(other, "ibrobot.session.views.length")
+                    for name in other.evaluate("ibrobot.session.views.map(({name}) => name)"):
+                        view(other, name)
+                        look_at(other, f"filled-{language}-{name}")
+    print("all", hand.total(), f"{eye.wrong} serious or critical", *problems, sep="\n")
+    sys.exit(1 if eye.wrong or problems else 0)
+
+
+if __name__ == "__main__":
+    main()
