@@ -21,6 +21,7 @@ from ibrobot_core.api import (
     Header,
     Image,
     Message,
+    MissingDependency,
     PointCloud2,
     PointField,
     Quaternion,
@@ -30,7 +31,7 @@ from ibrobot_core.api import (
     Vector3,
     ns,
 )
-from ibrobot_core.app import Component, ConfigError, MissingDependency, Session, single_options
+from ibrobot_core.app import Component, ConfigError, Session, single_options
 
 from .table_arm import make_robot
 
