@@ -3,9 +3,9 @@
     npm pack axe-core && tar xzf axe-core-*.tgz
     python plugins/ibrobot-plugin-web/tests/clicks.py FOLDER --axe package/axe.min.js [--keyboard] [--episodes 10]
 
-Counts the fewest clicks, keys and characters of each stage; with `--keyboard` the pointer is never used, and the tabs to
-each place are counted. Writes pictures of each screen, as `look.py` does, and then of every view and of the pages of the
-runs in Chinese, and prints what axe-core finds serious or critical. Needs Chromium, playwright and LeRobot.
+Counts the fewest clicks, keys and characters of each stage; with `--keyboard` the pointer is never used, and the tabs
+to each place are counted. Writes pictures of each screen, as `look.py` does, and at the end of every view, in English
+and Chinese, and prints what axe-core finds serious or critical. Needs Chromium, playwright and LeRobot.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import re
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ import look
 from look import Look, browser, view
 
 sys.path.insert(0, str(Path(__file__).parents[3] / "tests/shared"))
-from ui_path import own_robot, press, ui_process, until
+from ui_path import ROOT, press, ui_process, until
 
 _WAIT_MS = 90_000
 _TABS = 150
@@ -98,12 +99,26 @@ class Keyboard(Hand):
         raise AssertionError(f"{element}: not reached by {_TABS} tabs")
 
 
-def stages(hand: Hand, page: Any, look_at: Any, episodes: int) -> Any:
+def stages(hand: Hand, page: Any, look_at: Any, episodes: int) -> Iterator[str]:
     """Walk the way; yields the name of each stage that is done."""
-    nav = page.locator("#nav")
-    main = page.locator("#main")
+    run = begin(hand, page, look_at, episodes)
+    yield "choose the robot, begin to record"
+    judge(hand, page, run, look_at, episodes)
+    yield f"record and judge {episodes} episodes"
+    convert(hand, page, look_at)
+    yield "convert"
+    train(hand, page, look_at)
+    yield "train 50 steps"
+    launch(hand, page, look_at)
+    yield "launch the policy"
+    evaluate(hand, page, look_at)
+    yield "evaluate the policy"
+
+
+def begin(hand: Hand, page: Any, look_at: Any, episodes: int) -> Any:
+    """Start a session; returns its page."""
     look_at(page, "way-01-first")
-    hand.press(nav.get_by_role("link", name="Record", exact=True))
+    hand.press(page.locator("#nav").get_by_role("link", name="Record", exact=True))
     hand.type(page.get_by_label("Task"), "pick the cube")
     hand.type(page.get_by_label("Episodes", exact=True), str(episodes))
     look_at(page, "way-02-record")
@@ -113,8 +128,11 @@ def stages(hand: Hand, page: Any, look_at: Any, episodes: int) -> Any:
     run = opened.value
     run.wait_for_url(re.compile("^http"), wait_until="commit", timeout=_WAIT_MS)
     until(run, "window.ibrobot?.jogs.length && ibrobot.status.episode")
-    yield "choose the robot, begin to record"
+    return run
 
+
+def judge(hand: Hand, page: Any, run: Any, look_at: Any, episodes: int) -> None:
+    """Record and judge the episodes."""
     look_at(run, "way-03-run")
     for number in range(episodes):
         joint, index = (("shoulder_pan", 0), ("wrist_roll", 4))[number % 2]
@@ -132,16 +150,20 @@ def stages(hand: Hand, page: Any, look_at: Any, episodes: int) -> Any:
     look_at(run, "way-06-ended")
     page.bring_to_front()
     page.locator(".job .state.done").first.wait_for(timeout=_WAIT_MS)
-    yield f"record and judge {episodes} episodes"
 
+
+def convert(hand: Hand, page: Any, look_at: Any) -> None:
+    """Make a dataset of them."""
     look_at(page, "way-07-session")
     hand.press(page.locator(".job").get_by_role("link", name="Convert", exact=True))
     until(page, "document.querySelector('#field-out')?.value")
     look_at(page, "way-08-convert")
-    hand.press(main.get_by_role("button", name="Convert", exact=True))
+    hand.press(page.locator("#main").get_by_role("button", name="Convert", exact=True))
     page.get_by_role("link", name="Open the dataset").wait_for(timeout=_WAIT_MS)
-    yield "convert"
 
+
+def train(hand: Hand, page: Any, look_at: Any) -> None:
+    """Train a policy."""
     look_at(page, "way-09-converted")
     hand.press(page.locator(".job:visible").get_by_role("link", name="Train", exact=True))
     page.get_by_label("Steps", exact=True).wait_for()
@@ -150,28 +172,28 @@ def stages(hand: Hand, page: Any, look_at: Any, episodes: int) -> Any:
         steps.fill("")
     hand.type(steps, "50")
     look_at(page, "way-10-train")
-    hand.press(main.get_by_role("button", name="Train", exact=True))
+    hand.press(page.locator("#main").get_by_role("button", name="Train", exact=True))
     page.locator(".job:visible .state.running").first.wait_for(timeout=_WAIT_MS)
     page.wait_for_timeout(5000)
     look_at(page, "way-11-training")
     page.get_by_role("link", name="Use it in a robot").wait_for(timeout=4 * _WAIT_MS)
-    yield "train 50 steps"
 
+
+def launch(hand: Hand, page: Any, look_at: Any) -> None:
+    """Put the policy into the robot, and launch it."""
     look_at(page, "way-12-trained")
     hand.press(page.get_by_role("link", name="Use it in a robot"))
     page.get_by_role("button", name="Write the").wait_for(timeout=_WAIT_MS)
     look_at(page, "way-13-change")
     hand.press(page.get_by_role("button", name="Write the"))
-    launch = page.get_by_role("button", name="Launch it in simulation")
-    launch.wait_for()
+    button = page.get_by_role("button", name="Launch it in simulation")
+    button.wait_for()
     look_at(page, "way-14-written")
     with page.context.expect_page(timeout=_WAIT_MS) as opened:
-        hand.press(launch)
+        hand.press(button)
     trained = opened.value
     trained.wait_for_url(re.compile("^http"), wait_until="commit", timeout=_WAIT_MS)
     until(trained, "(window.ibrobot?.status?.counts.dispatch?.plan_length ?? 0) > 0")
-    yield "launch the policy"
-
     look_at(trained, "way-15-runs")
     page.bring_to_front()
     look_at(page, "way-16-running")
@@ -179,19 +201,22 @@ def stages(hand: Hand, page: Any, look_at: Any, episodes: int) -> Any:
     page.get_by_role("button", name="Stop the run").first.click()
     page.locator(".job .state.running").wait_for(state="hidden", timeout=_WAIT_MS)
     trained.close()
+
+
+def evaluate(hand: Hand, page: Any, look_at: Any) -> None:
+    """Count the successes of the policy."""
     view(page, "job-train")
     hand.press(page.locator(".job:visible").get_by_role("link", name="Evaluate", exact=True))
-    main.get_by_role("button", name="Evaluate", exact=True).wait_for()
+    page.locator("#main").get_by_role("button", name="Evaluate", exact=True).wait_for()
     page.wait_for_timeout(1500)
     look_at(page, "way-17-evaluate")
     hand.type(page.locator("#field-episodes"), "2")
-    hand.press(main.get_by_role("button", name="Evaluate", exact=True))
+    hand.press(page.locator("#main").get_by_role("button", name="Evaluate", exact=True))
     page.locator(".job:visible .state.done").first.wait_for(timeout=4 * _WAIT_MS)
     look_at(page, "way-18-evaluated")
     hand.press(page.locator(".job:visible").get_by_role("link", name=re.compile("Results")).first)
     page.wait_for_timeout(3000)
     look_at(page, "way-19-results")
-    yield "evaluate the policy"
 
 
 def main() -> None:
@@ -211,9 +236,9 @@ def main() -> None:
     begin_s, before, problems = time.monotonic(), hand.total(), list[str]()
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
-        own_robot(folder)
-        own = folder / "my_arm.yaml"  # looking at an episode takes longer than 20 s
-        own.write_text(own.read_text(encoding="utf-8").replace("max_duration_s: 20", "max_duration_s: 900"), "utf-8")
+        # Its policies need no pretrained weights; looking at an episode takes longer than 20 s.
+        own = (ROOT / "configs/so101_pick_cube.yaml").read_text(encoding="utf-8")
+        (folder / "my_arm.yaml").write_text(re.sub("max_duration_s: [0-9]+", "max_duration_s: 900", own), "utf-8")
         with ui_process(folder) as address, browser() as chromium:
             page = look.opened(chromium, address)
             page.context.set_default_timeout(_WAIT_MS)

@@ -61,7 +61,7 @@ export class View {
   async place() {
     try {
       const { folder, episodes, free_bytes: free, episode_bytes: size } = await this.ui.get("record/place", { dataset: this.form.values.dataset || undefined });
-      const room = size ? `, room for about ${Math.floor(free / size)} episodes of ${(size / MIB).toFixed(1)} MiB` : "";
+      const room = size ? `, room for about ${Number(Math.floor(free / size).toPrecision(2)).toLocaleString()} episodes of ${(size / MIB).toFixed(1)} MiB` : "";
       say(this.disk, `${folder}: ${episodes} episode${episodes === 1 ? "" : "s"} so far · ${(free / GIB).toFixed(1)} GiB of disk left${room}`);
       this.disk.classList.remove("bad");
     } catch (error) {
