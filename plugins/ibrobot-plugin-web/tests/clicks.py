@@ -11,6 +11,7 @@ and Chinese, and prints what axe-core finds serious or critical. Needs Chromium,
 from __future__ import annotations
 
 import argparse
+import importlib
 import re
 import sys
 import tempfile
@@ -19,12 +20,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import look
-from look import Look, browser, view
-
 sys.path.insert(0, str(Path(__file__).parents[3] / "tests/shared"))
 from ui_path import ROOT, press, ui_process, until
 
+look: Any = importlib.import_module("look")  # beside this file
 _WAIT_MS = 90_000
 _TABS = 150
 """Most tabs to a place."""
@@ -197,19 +196,22 @@ def launch(hand: Hand, page: Any, look_at: Any) -> None:
     look_at(trained, "way-15-runs")
     page.bring_to_front()
     look_at(page, "way-16-running")
-    view(page, "jobs")
-    page.get_by_role("button", name="Stop the run").first.click()
-    page.locator(".job .state.running").wait_for(state="hidden", timeout=_WAIT_MS)
+    other = page.context.new_page()
+    other.goto(page.url.split("#")[0])
+    look.view(other, "jobs")
+    other.get_by_role("button", name="Stop the run").first.click()
+    other.locator(".job .state.running").wait_for(state="hidden", timeout=_WAIT_MS)
+    other.close()
     trained.close()
 
 
 def evaluate(hand: Hand, page: Any, look_at: Any) -> None:
     """Count the successes of the policy."""
-    view(page, "job-train")
-    hand.press(page.locator(".job:visible").get_by_role("link", name="Evaluate", exact=True))
+    hand.press(page.get_by_role("link", name="Evaluate it in simulation"))
     page.locator("#main").get_by_role("button", name="Evaluate", exact=True).wait_for()
     page.wait_for_timeout(1500)
     look_at(page, "way-17-evaluate")
+    page.locator("#field-episodes").fill("")
     hand.type(page.locator("#field-episodes"), "2")
     hand.press(page.locator("#main").get_by_role("button", name="Evaluate", exact=True))
     page.locator(".job:visible .state.done").first.wait_for(timeout=4 * _WAIT_MS)
@@ -230,7 +232,7 @@ def main() -> None:
     chosen = parser.parse_args()
     for size in ("zoom", "wide"):
         del look.SIZES[size]
-    eye = Look(chosen.folder, chosen.axe.read_text(encoding="utf-8") if chosen.axe is not None else "")
+    eye = look.Look(chosen.folder, chosen.axe.read_text(encoding="utf-8") if chosen.axe is not None else "")
     look_at = (lambda page, name: None) if chosen.no_pictures else eye
     hand = Keyboard() if chosen.keyboard else Hand()
     begin_s, before, problems = time.monotonic(), hand.total(), list[str]()
@@ -239,7 +241,7 @@ def main() -> None:
         # Its policies need no pretrained weights; looking at an episode takes longer than 20 s.
         own = (ROOT / "configs/so101_pick_cube.yaml").read_text(encoding="utf-8")
         (folder / "my_arm.yaml").write_text(re.sub("max_duration_s: [0-9]+", "max_duration_s: 900", own), "utf-8")
-        with ui_process(folder) as address, browser() as chromium:
+        with ui_process(folder) as address, look.browser() as chromium:
             page = look.opened(chromium, address)
             page.context.set_default_timeout(_WAIT_MS)
             page.on("pageerror", lambda error: problems.append(str(error)))
@@ -259,7 +261,7 @@ def main() -> None:
                     other = look.opened(chromium, address)
                     until(other, "ibrobot.session.views.length")
                     for name in other.evaluate("ibrobot.session.views.map(({name}) => name)"):
-                        view(other, name)
+                        look.view(other, name)
                         look_at(other, f"filled-{language}-{name}")
     print("all", hand.total(), f"{eye.wrong} serious or critical", *problems, sep="\n")
     sys.exit(1 if eye.wrong or problems else 0)

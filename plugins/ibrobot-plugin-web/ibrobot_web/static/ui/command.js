@@ -17,13 +17,13 @@ export class View {
     element.append(h("h2", {}, this.title), this.form.element, h("h2", {}, "Jobs"), this.jobs.element);
   }
 
-  // The address may fill in a field: FIELD=VALUE.
+  // The address may fill in fields: FIELD=VALUE, one in each line.
   async show(shown, rest) {
     if (!shown) return;
     this.jobs.show();
     await this.load();
-    const [, name, value] = /^(\w+)=(.*)$/.exec(rest) ?? [];
-    if (name && rest !== this.filled) this.form.enter({ [name]: value }, true);
+    const given = [...(rest ?? "").matchAll(/^(\w+)=(.*)$/gm)].map(([, name, value]) => [name, value]);
+    if (given.length && rest !== this.filled) this.form.enter(Object.fromEntries(given), true);
     this.filled = rest;
   }
 

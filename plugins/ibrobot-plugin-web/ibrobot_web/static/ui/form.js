@@ -71,7 +71,7 @@ class Field {
       const input = h("input", { type: "text", placeholder: "several, with commas between them", ...described });
       this.elements = [h("label", { for: id }, field.label), h("div", {}, input, help)];
       this.value = () => input.value.split(",").map((text) => text.trim()).filter(Boolean);
-      this.enter = (entered) => { input.value = entered.join(", "); };
+      this.enter = (entered) => { input.value = [entered].flat().join(", "); };
       return;
     }
     if (field.several) {
@@ -94,7 +94,7 @@ class Field {
       const box = h("input", { type: "checkbox", checked: field.default === true, ...described });
       this.elements = [label, h("div", { class: "flag" }, box, help)];
       this.value = () => box.checked;
-      this.enter = (entered) => { box.checked = entered; };
+      this.enter = (entered) => { box.checked = Boolean(entered); };
     } else if (closed) {
       const select = h("select", described, choices.map(([value, text]) => h("option", { value, selected: value === field.default }, text)));
       this.elements = [label, h("div", {}, select, help)];

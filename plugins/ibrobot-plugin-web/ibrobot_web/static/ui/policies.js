@@ -89,10 +89,13 @@ export class View {
     toast(`${done.robot} is written.`);
     const launched = { robot: done.robot, sim: true, mode: done.mode };
     remember(launched);
+    const evaluation = this.ui.session.views.find(({ name }) => name === "job-eval");
+    const filled = `${evaluation?.takes.robot}=${done.robot}\nmode=${done.mode}\nsim=yes`;
     this.change.replaceChildren(h("p", {}, `${done.robot} is written; its mode ${done.mode} runs the policy.`),
       h("p", { class: "warned" }, "The robot moves by itself as soon as the run has started, until you stop it."),
       h("div", { class: "row" },
         h("button", { class: "primary", onclick: () => this.ui.openRun(() => this.ui.post("robots/launch", launched)) }, "Launch it in simulation"),
+        evaluation && h("a", { class: "button", href: `#${evaluation.name}/${encodeURIComponent(filled)}` }, "Evaluate it in simulation"),
         h("a", { class: "button", href: "#robots" }, "Choose how to launch it")));
     await this.load();
   }

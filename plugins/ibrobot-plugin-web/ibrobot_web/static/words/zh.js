@@ -417,6 +417,7 @@ export default {
   "{} is written; its mode {} runs the policy.": "已写入 {}；其模式 {} 运行此策略。",
   "Launch it in simulation": "在仿真中启动",
   "Choose how to launch it": "选择启动方式",
+  "Evaluate it in simulation": "在仿真中评测",
   "Send": "发送",
   "{}: the start over the live picture": "{}：开始时的图像叠加在实时图像上",
   "{}: the start": "{}：开始时",
