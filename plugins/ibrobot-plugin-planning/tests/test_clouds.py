@@ -10,6 +10,7 @@ from typing import Any, override
 import attrs
 import numpy as np
 import pytest
+from ibrobot_planning import ibrobot_sections
 from ibrobot_planning.world.clouds import CLEAR, SensedWorld
 from ibrobot_planning.world.objects import OBSERVED, Plane, Voxels
 from ibrobot_planning.world.options import WorldOptions
