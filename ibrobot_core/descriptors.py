@@ -167,6 +167,8 @@ class Descriptor[T]:
     Raises:
         MissingDependency: e.g. if a system library is missing. A run continues without a sensor that it does not need.
     """
+    unsaid: Callable[[Mapping[str, Any]], Mapping[str, Any] | None] = _answer(None)
+    """Of a guard: the section `control.guard` for the plain values of a robot YAML without one; None for no guard."""
     default: bool = attrs.field(default=False, kw_only=True)
     """Whether commands use this type by default; at most one type of each kind."""
 

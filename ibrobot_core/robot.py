@@ -62,6 +62,9 @@ class Description:
     urdf: Path | None = option(None, help="URDF model: a path, or package://PYTHON_PACKAGE/path")
     srdf: Path | None = option(None, help="SRDF with groups, poses and pairs of links that may touch: a path as above")
     tip: str = option("gripperframe", help="site (MJCF) or link (URDF) of the tool centre point")
+    floor: float | None = option(
+        None, unit="m", help="height of the table or floor on which the arm stands, in the base frame; none: unknown"
+    )
     poses: Mapping[str, tuple[float, ...]] = option(factory=dict, unit="rad", help="joint positions in joint order")
     arms: Mapping[str, tuple[float, float, float, float]] = option(
         factory=dict,

@@ -130,6 +130,9 @@ def _override(document: Document, overrides: Sequence[str], mode: str | None) ->
 
 
 def _build(document: Document, source: Path, sim: bool, registry: Registry, communicates: bool = False) -> RobotConfig:
+    for each in registry.of_kind("guard"):
+        if (unsaid := each.unsaid(document.root)) is not None:
+            put(document, "control.guard", Document(dict(unsaid), {}, [], ""), Place(0, 0, 0, "the default of control"))
     sections = SectionParser(document, registry, source.absolute().parent, sim).sections()
     check_known(document)
     simulated = document.get("simulation", "default_control_mode") if sections.simulated else None
@@ -141,22 +144,18 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
         document, sections.plain, sections.missing, entered, everything=communicates, simulable=simulable
     )
     contract_checks = ContractChecks(document, sections)
-    contract = contract_checks.run()
+    contract, observations = contract_checks.run(), contract_checks.observations
     document.raise_problems()
     shown, secrets = public(document)
     robot = sections.plain["robot"]
     executors, models = _components(sections.executors), _components(sections.models)
+    planners, inference = _components(sections.planners), _components(sections.inference)
     hardware = {} if sections.simulated else _components(sections.hardware)
     arguments = {
         **sections.plain,
         "executors": {name: attrs.evolve(each, joints=robot.groups[each.group]) for name, each in executors.items()},
         "control_modes": {
-            name: attrs.evolve(
-                mode,
-                name=name,
-                planner=_component(sections.planners.get(name)),
-                inference=_component(sections.inference.get(name)),
-            )
+            name: attrs.evolve(mode, name=name, planner=planners.get(name), inference=inference.get(name))
             for name, mode in sections.plain["control_modes"].items()
         },
         "default_control_mode": entered,
@@ -167,10 +166,7 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
         "peripherals": {name: attrs.evolve(part.component, sim={}) for name, part in sections.peripherals.items()}
         | _not_installed(document, sections),
         "models": {
-            name: attrs.evolve(
-                each,
-                extra_observations=contract_checks.observations(sections.models[name].key, each.extra_observations),
-            )
+            name: attrs.evolve(each, extra_observations=observations(sections.models[name].key, each.extra_observations))
             for name, each in models.items()
         },
         "teleoperation": _components(sections.teleoperation),

@@ -10,6 +10,7 @@ from ibrobot_core.app import Command, Kind, SectionDescriptor, SourceDescriptor
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
 from ibrobot_planning.guard.descriptor import GuardDescriptor
 from ibrobot_planning.guard.options import ClearanceGuardOptions
+from ibrobot_planning.guard.unsaid import GuardNotice, unsaid
 from ibrobot_planning.planner import PlannerDescriptor
 from ibrobot_planning.planners.options import GoalCheckOptions, JointPlannerOptions, RrtConnectOptions
 from ibrobot_planning.world.engines import find_engines
@@ -53,6 +54,7 @@ def ibrobot_guards() -> Iterable[GuardDescriptor]:
         options=ClearanceGuardOptions,
         make=Late("ibrobot_planning.guard.clearance_guard:ClearanceGuard"),
         check=find_engines,
+        unsaid=unsaid,
         summary="keeps commands of every origin clear of the arm itself and of the world",
     )
 
@@ -127,6 +129,12 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
         make=lambda options, session: Late("ibrobot_planning.guard.feed:GuardFeed")(session),
         without_section=_feeds_guard,
         summary="tells the guard of changes of the world; runs by itself with `control.guard` and `world`",
+    )
+    yield SectionDescriptor(
+        type="guarded",
+        make=lambda options, session: GuardNotice(session),
+        without_section=lambda config: config.robot.description.mjcf is not None,
+        summary="says at the start what commands are guarded against; runs by itself with a model of the arm",
     )
     yield SectionDescriptor(
         type="tasks",

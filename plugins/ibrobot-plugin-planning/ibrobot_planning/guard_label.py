@@ -7,10 +7,7 @@ import json
 
 def in_words(label: str) -> str:
     """A label of the guard for people."""
-    read = json.loads(label)
-    if read["distance"] is None:
-        return f"{read['first']}: {read['second']}"
-    return f"{read['first']} was {1000 * read['distance']:.1f} mm from {read['second']}"
+    return str(json.loads(label)["text"])
 
 
 def touches(label: str) -> bool:

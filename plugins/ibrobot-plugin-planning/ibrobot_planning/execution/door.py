@@ -146,7 +146,7 @@ class GoalDoor(SessionWorker):
     def _paths(self) -> FreePaths:
         from ibrobot_planning.planners.paths import FreePaths
 
-        return FreePaths(lambda: self._arm, self.session.bus)
+        return FreePaths(lambda: self._arm, self.session.bus, self._robot.description.floor)
 
     @property
     def _arm(self) -> Any:

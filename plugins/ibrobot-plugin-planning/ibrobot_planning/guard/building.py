@@ -41,15 +41,21 @@ class Building:
 
     Args:
         arm: the arm.
-        make: makes the pairs of a world.
+        permit: adds to a world what the guard knows besides, and what may be touched.
+        make: makes the pairs of such a world.
         log: for objects that are left out.
         in_thread: whether to build in a thread; else in `add`, as stepped time needs it.
     """
 
-    def __init__(self, arm: Arm, make: Callable[[World], Pairs], log: logging.Logger, *, in_thread: bool) -> None:
-        self._arm, self._make, self._log = arm, make, log
-        self._world = self._made = World()
-        """As it was reported, and that of the last pairs."""
+    def __init__(
+        self, arm: Arm, permit: Callable[[World], World], make: Callable[[World], Pairs], log: logging.Logger, *,
+        in_thread: bool,
+    ) -> None:  # fmt: skip
+        self._arm, self._permit, self._make, self._log = arm, permit, make, log
+        self._world = World()
+        """As it was reported."""
+        self._made = permit(self._world)
+        """That of the last pairs."""
         self._changes: queue.SimpleQueue[WorldChange] = queue.SimpleQueue()
         self._in_thread = in_thread
         self._thread: threading.Thread | None = None
@@ -84,16 +90,16 @@ class Building:
             self._build(changes)
 
     def _build(self, changes: list[WorldChange]) -> None:
-        before, world = self._made, self._world
+        world = self._world
         for change in changes:
             usable = {name: thing for name, thing in change.changed.items() if self._is_usable(name, change)}
             world = attrs.evolve(change, changed=usable).apply(world)
         self._world = world
         self.changes += len(changes)
         stale = changes[-1].stale
-        difference = WorldChange.between(before, world)
-        moved = difference.only_moved(before)
         try:
+            world = self._permit(world)
+            moved = WorldChange.between(self._made, world).only_moved(self._made)
             if moved is None:
                 self.finished.append(Finished(stale, self._make(world)))
             else:

@@ -82,7 +82,7 @@ def _written(thing: WorldObject) -> dict[str, Any]:
     p, o = thing.pose.position, thing.pose.orientation
     return {
         "shape": _written_shape(thing.shape), "pose": [p.x, p.y, p.z, o.x, o.y, o.z, o.w], "link": thing.link,
-        "may_touch": sorted(thing.may_touch),
+        "may_touch": sorted(thing.may_touch), "movable": thing.movable,
     }  # fmt: skip
 
 
@@ -96,6 +96,7 @@ def _read(thing: Mapping[str, Any]) -> WorldObject:
         Pose(Vector3(x, y, z), Quaternion(qx, qy, qz, qw)),
         None if link is None else str(link),
         frozenset(map(str, thing["may_touch"])),
+        bool(thing["movable"]),
     )
 
 

@@ -6,20 +6,20 @@ import json
 from collections.abc import Mapping
 from typing import Any, override
 
-import attrs
 import numpy as np
 import pinocchio
 from ibrobot_kinematics.poses import matrix
 
-from ibrobot_core.api import Context, Pose, SteppedClock, Vector, Vector3, seconds
+from ibrobot_core.api import Context, SteppedClock, Vector, seconds
 from ibrobot_core.app import Guard
 from ibrobot_planning.guard.building import Building, Finished
 from ibrobot_planning.guard.changes import WorldChange
 from ibrobot_planning.guard.options import ClearanceGuardOptions
 from ibrobot_planning.guard.pairs import Indices, Pairs
-from ibrobot_planning.world.arm import Arm, sorted_pair
+from ibrobot_planning.guard.permissions import Permissions
+from ibrobot_planning.world.arm import Arm
 from ibrobot_planning.world.checked_arm import may_touch_arm
-from ibrobot_planning.world.objects import FLOOR, Plane, World, WorldObject
+from ibrobot_planning.world.objects import World
 
 _HISTORY_S = 0.5
 """How long a joint may lag behind its commands and still be on their path [s]."""
@@ -53,16 +53,15 @@ class ClearanceGuard(Guard):
         self._period_s = period_s
         self._change: Vector = context.robot.max_acceleration * period_s**2
         self._follows = ~np.asarray(context.robot.grips)
-        floor = options.floor
-        self._fixed = {} if floor is None else {FLOOR: WorldObject(Plane(), Pose(Vector3(0.0, 0.0, floor)))}
-        self._pressed = {
-            sorted_pair(name, other): options.press for name, others in options.may_touch.items() for other in others
-        }
+        self._permissions = Permissions(options, context.robot, self._arm)
         self._begin: Vector = np.zeros(len(self._arm.joint_names))
         """The last command [rad], shape (J,)."""
-        self._pairs = self._made(World())
+        empty = self._permissions.applied(World())
+        self._pairs = self._made(empty)
         in_thread = not isinstance(context.clock, SteppedClock)
-        self._building = Building(self._arm, self._made, context.log, in_thread=in_thread)
+        self._building = Building(
+            self._arm, self._permissions.applied, self._made, context.log, in_thread=in_thread
+        )
         self._stale = self._label = ""
         self._pair: tuple[str, ...] = ()
         """What the last setpoint was about to touch."""
@@ -201,23 +200,16 @@ class ClearanceGuard(Guard):
         for name, pose in finished.moved:
             self._pairs.move(name, pinocchio.SE3(matrix(pose)))
 
-    def _whole(self, world: World) -> World:
-        """A world with the table, and with what the options permit."""
-        free, objects = self._options.free, {**self._fixed, **world.objects}
-        for name in free.keys() & objects.keys():
-            objects[name] = attrs.evolve(objects[name], may_touch=objects[name].may_touch.union(free[name]))
-        return World(objects)
-
     def _made(self, world: World) -> Pairs:
-        """The pairs of a world; also called in another thread."""
-        options, pressed = self._options, self._pressed
-        made = Pairs(
-            self._arm, self._whole(world), margin=options.margin, self_margin=options.self_margin, pressed=pressed
-        )
+        """The pairs of a world with what may be touched; also called in another thread."""
+        options, pressed = self._options, self._permissions.pressed
+        made = Pairs(self._arm, world, margin=options.margin, self_margin=options.self_margin, pressed=pressed)
         made.estimate(self._begin)
         return made
 
 
 def _label(first: str, second: str, distance: float | None) -> str:
     """As `overruled`: two things and their distance [m], or `world` and why it is not known well enough."""
-    return json.dumps({"first": first, "second": second, "distance": None if distance is None else round(distance, 4)})
+    away = None if distance is None else round(distance, 4)
+    text = f"{first}: {second}" if away is None else f"{first} was {1000 * away:.1f} mm from {second}"
+    return json.dumps({"first": first, "second": second, "distance": away, "text": text})

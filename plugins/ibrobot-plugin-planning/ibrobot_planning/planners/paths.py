@@ -36,7 +36,7 @@ class Margins(Protocol):
 
     @property
     def floor(self) -> float | None:
-        """Height of the floor in the base frame [m]; everything below is blocked."""
+        """Height of the floor in the base frame [m]; everything below is blocked. None: that of the description."""
 
 
 class FreePaths:
@@ -45,20 +45,24 @@ class FreePaths:
     Args:
         arm: the arm, once it is loaded.
         bus: serves the world; None without a run.
+        floor: height of the floor for margins that do not say it [m]; None: there is none.
         world: the objects, if the run has no section `world`.
     """
 
-    def __init__(self, arm: Callable[[], Arm], bus: Bus | None, world: Callable[[], World] = World) -> None:
-        self._arm, self._bus, self._world = arm, bus, world
+    def __init__(
+        self, arm: Callable[[], Arm], bus: Bus | None, floor: float | None, world: Callable[[], World] = World
+    ) -> None:
+        self._arm, self._bus, self._floor, self._world = arm, bus, floor, world
         self._free: deque[tuple[JointTrajectory, World]] = deque(maxlen=16)
         """Trajectories, each with the world in which it is free."""
 
     def snapshot(self, margins: Margins) -> World:
         """The present world, with the floor."""
         world = world_of(self._bus, self._world)
-        if margins.floor is None or FLOOR in world.objects:
+        floor = self._floor if margins.floor is None else margins.floor
+        if floor is None or FLOOR in world.objects:
             return world
-        return world.add(FLOOR, WorldObject(Plane(), Pose(Vector3(0.0, 0.0, margins.floor))))
+        return world.add(FLOOR, WorldObject(Plane(), Pose(Vector3(0.0, 0.0, floor))))
 
     def note(self, trajectory: JointTrajectory, world: World) -> None:
         """Remember that a trajectory, or all of it that is still new, is free in a world."""

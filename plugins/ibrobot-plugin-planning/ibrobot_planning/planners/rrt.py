@@ -67,7 +67,7 @@ class RrtConnectPlanner(Planner):
         self._ctx = ctx
         self._arm: Arm | None = None
         self._tool: Tool | None = None
-        self._paths = FreePaths(lambda: self.arm, ctx.bus, lambda: self.world)
+        self._paths = FreePaths(lambda: self.arm, ctx.bus, ctx.robot.description.floor, lambda: self.world)
 
     @override
     def load(self) -> None:

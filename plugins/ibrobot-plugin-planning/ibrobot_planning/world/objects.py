@@ -174,6 +174,8 @@ class WorldObject:
     """The link that carries it, e.g. the gripper; None: it stands in the base frame."""
     may_touch: frozenset[str] = attrs.field(default=frozenset(), converter=_names)
     """Links and objects that it may touch."""
+    movable: bool = False
+    """Whether a guard lets the hand touch it; planners keep away nevertheless."""
 
     def __attrs_post_init__(self) -> None:
         p, o = self.pose.position, self.pose.orientation

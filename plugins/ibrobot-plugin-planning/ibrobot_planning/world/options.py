@@ -31,7 +31,12 @@ WhenStale = Literal["refuse", "keep", "forget"]
 _RULE = "when it is older: `refuse` plans and stop planned motions, `keep` what was seen last, or `forget` it"
 
 
-def _near(instance: object, attribute: attrs.Attribute[Any], value: Sequence[float] | None) -> None:
+def near(instance: object, attribute: attrs.Attribute[Any], value: Sequence[float] | None) -> None:
+    """Check that numbers are plausible as positions [m] or angles [rad].
+
+    Raises:
+        ValueError: if one is not.
+    """
     # Written so that NaN fails it.
     if not all(abs(number) <= FURTHEST for number in value or ()):
         raise ValueError(f"must be numbers from -{FURTHEST:g} to {FURTHEST:g}, got {list(value or ())}")
@@ -46,19 +51,22 @@ class ObjectOptions:
         help="box about its centre, sphere, cylinder or capsule along z, everything below z = 0, or triangles of a file"
     )
     size: tuple[float, float, float] | None = option(
-        None, unit="m", validator=_near, help="lengths of a box along x, y and z"
+        None, unit="m", validator=near, help="lengths of a box along x, y and z"
     )
     radius: float | None = option(None, unit="m", gt=0, help="of a sphere, cylinder or capsule")
     height: float | None = option(None, unit="m", gt=0, help="of a cylinder, or of the cylinder of a capsule")
     file: Path | None = option(None, help="mesh: STL, OBJ or PLY")
     scale: float = option(1.0, gt=0, help="factor of the mesh's numbers, e.g. 0.001 for millimetres")
     convex: bool = option(False, help="take the mesh's convex hull: solid, and faster to check")
-    position: tuple[float, float, float] = option((0.0, 0.0, 0.0), unit="m", validator=_near, help="in the base frame")
+    position: tuple[float, float, float] = option((0.0, 0.0, 0.0), unit="m", validator=near, help="in the base frame")
     rpy: tuple[float, float, float] = option(
-        (0.0, 0.0, 0.0), unit="rad", validator=_near, help="turns about the base's x, y and z axis"
+        (0.0, 0.0, 0.0), unit="rad", validator=near, help="turns about the base's x, y and z axis"
     )
     link: str | None = option(None, help="link of the MJCF that carries it; its position and turns are in that frame")
     may_touch: tuple[str, ...] = option((), help="links and objects that it may touch")
+    movable: bool = option(
+        False, help="the guard lets the hand grasp and push it, e.g. for a policy; planners keep away nevertheless"
+    )
     max_age: float | None = option(
         None, unit="s", gt=0, help="greatest age of its pose, which /world/move renews; none: it stays where it is"
     )
@@ -93,7 +101,7 @@ class ObjectOptions:
         else:
             sizes = attrs.asdict(self, filter=lambda field, _: field.name in _KEYS[self.shape])
             shape = SIMPLE[self.shape](**sizes)
-        return WorldObject(shape, pose_at(self.position, self.rpy), self.link, self.may_touch)
+        return WorldObject(shape, pose_at(self.position, self.rpy), self.link, self.may_touch, self.movable)
 
 
 def _check_topic(instance: object, attribute: attrs.Attribute[str], value: str) -> None:
@@ -238,7 +246,7 @@ class Moved:
 
     name: str = option(help="the object's name")
     position: tuple[float, float, float] = option(
-        unit="m", validator=_near, help="in the object's frame: of the base, or of the link that carries it"
+        unit="m", validator=near, help="in the object's frame: of the base, or of the link that carries it"
     )
     rpy: tuple[float, float, float] = option((0.0, 0.0, 0.0), unit="rad", help="turns about its x, y and z axis")
     stamp_ns: int = option(0, unit="ns", ge=0, help="when its pose was measured; 0: now")

@@ -103,7 +103,7 @@ def first_world(options: WorldOptions, scene: Sequence[SceneObject]) -> World:
             raise PlanningError(
                 f"the simulated scene has an object {thing.name!r}; leave world.objects.{thing.name} out"
             )
-        world = world.add(thing.name, WorldObject(_shape(thing), thing.pose))
+        world = world.add(thing.name, WorldObject(_shape(thing), thing.pose, movable=bool(thing.topic)))
     return world
 
 
