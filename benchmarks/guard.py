@@ -1,15 +1,15 @@
 """Whether the guard keeps arms out of themselves and the world, whoever commands, by MuJoCo's collision detection.
 
-    python benchmarks/guard.py [--commands 30000] [--trials 200] [--arms so101 bi_so101 ur5] [--processes 2] [--seed 0]
+    python benchmarks/guard.py [--commands 30000] [--trials 200] [--arms so101 …] [--processes 2] [--seed 0]
 
-An SO-101, two of them, and a UR5 made from its URDF, on a table. Five kinds of commands take turns (a policy, a leader,
-limits, twists, trajectories), most of them aimed at configurations in contact, while posts, bars, walls and cubes come,
-move and go. `commanded`: the safety layer with the guard; a tenth as many commands without it, for comparison.
-`simulated`: the whole of control with the simulated arm, a twentieth as many; also the way that the joints take.
-`appears`: an object appears on the way of a moving arm. `backs_out`: near objects or in contact, an operator drives
-joints out. Exits with 1 if a command leads into contact, a pair comes a millimetre nearer than its margin, a simulated
-arm touches, an arm comes nearer than by braking at once or says another distance than MuJoCo, or an operator does not
-come out.
+An SO-101, two of them, and a UR5 and an FR3 made from their URDFs, on a table. Five kinds of commands take turns (a
+policy, a leader, limits, twists, trajectories), most of them aimed at configurations in contact, while posts, bars,
+walls and cubes come, move and go. `commanded`: the safety layer with the guard; a tenth as many commands without it,
+for comparison. `simulated`: the whole of control with the simulated arm, a twentieth as many; also the way that the
+joints take. `appears`: an object appears on the way of a moving arm. `backs_out`: near objects or in contact, an
+operator drives joints out. Exits with 1 if a command leads into contact, a pair comes a millimetre nearer than its
+margin, a simulated arm touches, an arm comes nearer than by braking at once or says another distance than MuJoCo, or an
+operator does not come out.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--commands", type=int, default=30_000, help="of all arms together")
     parser.add_argument("--trials", type=int, default=200, help="of `appears`, and of `backs_out`")
-    parser.add_argument("--arms", nargs="+", default=["so101", "bi_so101", "ur5"])
+    parser.add_argument("--arms", nargs="+", default=["so101", "bi_so101", "ur5", "fr3"])
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
@@ -102,7 +102,7 @@ def main() -> int:
     failed: dict[str, list[str]] = {}
     with tempfile.TemporaryDirectory() as name, multiprocessing.get_context("spawn").Pool(asked.processes) as pool:
         folder = Path(name)
-        guard_trials.stations(folder)  # writes the UR5
+        guard_trials.stations(folder)  # writes the UR5 and the FR3
         for kind in KINDS:
             todo = [(folder, arm, kind, seed) for seed in seeds(kind, asked) for arm in asked.arms]
             came = list(pool.imap(trial, todo))

@@ -2,10 +2,10 @@
 
     python benchmarks/guard_experts.py [--episodes 20] [--seed 200] [--policy CHECKPOINT]
 
-The scripted experts pick a cube (also with the scene's objects in the section `world`), push, stack, sort, open a drawer
-and hand a bar over, each with the guard that the robot YAML has and with `control.guard=null`. `--policy` adds a policy
-that LeRobot has trained on the pick, e.g. of the tutorial "Train a policy". Exits with 1 if an expert succeeds less often
-with the guard, or takes more than 1 % longer in the episodes that both finish.
+The scripted experts pick a cube (also with the objects of the scene in the section `world`), push, stack, sort, open a
+drawer and hand a bar over, each with the guard of the robot YAML and with `control.guard=null`. `--policy` adds a
+policy that LeRobot has trained on the pick, e.g. of the tutorial "Train a policy". Exits with 1 if they succeed less
+often with the guard, or take more than 1 % longer.
 """
 
 from __future__ import annotations

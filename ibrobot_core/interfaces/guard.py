@@ -14,7 +14,8 @@ class Guard(ABC):
 
     Attributes:
         overruled: what a changed setpoint of the last tick was about to touch, as JSON: the names `first` and `second`,
-            and their `distance` [m] when this began; empty if it passed. `/guard` has a message for each change.
+            their `distance` [m] when this began, and that in words as `text`; empty if it passed. `/guard` has a
+            message for each change.
         counts: counts since construction, by name, for `/diagnostics`.
     """
 

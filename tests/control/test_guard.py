@@ -12,9 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ibrobot_core.api import Descriptor, Joint, Robot
-from ibrobot_core.control.commands import ClearFaults
+from ibrobot_core.control.commands import BeginStartup, ClearFaults
 from ibrobot_core.control.safety import SafetyLayer
 from ibrobot_core.interfaces import Executor, Guard
+from ibrobot_core.interfaces.hardware import Condition, Severity
 from ibrobot_core.plugins import Entry
 
 PERIOD_S = 0.01
@@ -25,7 +26,8 @@ ROBOT = Robot(
 )
 
 
-LABEL = '{"first": "x", "second": "y", "distance": 0.01}'
+HOT = Condition("lift", "temperature", 58.0, "deg C", Severity.WARNING, "lift is hot", True)
+LABEL = '{"first": "x", "second": "y", "distance": 0.01, "text": "x was 10.0 mm from y"}'
 
 
 class Says(Guard):
@@ -187,3 +189,31 @@ class TestInControl:
         counters = rig.core.counters()
         assert counters["guard"] == {"ticks": 3, "pairs": 302}
         assert not {"guard_pairs", "pairs", "ticks"} & counters["safety"].keys(), "evaluations add these up"
+
+
+POSES = {
+    "control.startup": {"startup": "pose rest"},
+    "control.stop": {"stop": "pose rest"},
+    "control.load_shedding": {"load_shedding": {"after": 0.1, "pose": "rest"}},
+}
+
+
+@pytest.mark.parametrize("key", POSES)
+def test_motions_to_poses_of_the_robot_yaml_are_guarded(make_rig, key: str) -> None:
+    """The guard lets pan go no further than -0.3; the pose `rest` has it at -0.8."""
+    guard = Says(lambda setpoint: np.maximum(setpoint, [-0.3, -9.0, -9.0]))
+    entry = Entry("guard", Descriptor("says", lambda options, ctx: guard, "says"), "fake", "fake", "1.0")
+    rig = make_rig({"control": {"guard": {"type": "says"}, **POSES[key]}}, entries=[entry])
+    if key == "control.startup":
+        rig.core.start("stream")
+        rig.call(BeginStartup())
+    else:
+        rig.start()
+    if key == "control.stop":
+        rig.core.begin_stop()
+    if key == "control.load_shedding":
+        rig.hardware.conditions = (HOT,)
+    rig.tick(300)
+    pan, lift, _ = np.array(rig.hardware.written).T
+    assert pan.min() == pytest.approx(-0.3, abs=0.01), "braking included"
+    assert lift.max() > 0.9

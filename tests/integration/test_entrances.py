@@ -18,7 +18,10 @@ import entrances
 import numpy as np
 import pytest
 from entrance_table import COLUMNS, read_table
-from entrances import CAGE, FAR, WALL, Entrance, Operated
+from entrances import CAGE, FAR, UNGUARDED, WALL, Entrance, Operated
+from ibrobot_planning.world.checked_arm import may_touch_arm
+from ibrobot_planning.world.collision import Collisions
+from ibrobot_planning.world.objects import observed_world
 from ibrobot_testing.site import made_up_site
 
 pytestmark = pytest.mark.integration
@@ -87,12 +90,14 @@ _LATE = (
 )
 _ALIKE = f"{_SERVER}::test_every_execution_mode_moves_alike"
 _GONE = f"{_SERVER}::test_the_arm_holds_while_the_server_is_gone_and_goes_on_when_it_is_back"
+_POSES = "tests/control/test_guard.py::test_motions_to_poses_of_the_robot_yaml_are_guarded"
 ELSEWHERE: Mapping[tuple[str, str], str] = {
     ("page reset", "older"): _PAGE,
     ("page intervene", "older"): _PAGE,
     **{(name, "older"): _LATE for name in _SERVICES},
     **{(name, "STOP"): _LOST for name in ("source intervene", "page intervene", "/intervene")},
     ("engine distributed", "world"): _ALIKE,
+    ("engine distributed", "guard"): _ALIKE,
     ("engine distributed", "numbers"): _ALIKE,
     ("engine distributed", "STOP"): _ALIKE,
     ("engine distributed", "silence"): _GONE,
@@ -100,6 +105,7 @@ ELSEWHERE: Mapping[tuple[str, str], str] = {
     ("ibrobot replay", "numbers"): (
         "plugins/ibrobot-plugin-data/tests/test_playback.py::test_a_command_that_is_not_finite_is_refused"
     ),
+    **{(f"control.{key}", "guard"): _POSES for key in ("startup", "stop", "load_shedding")},
     ("control.startup", "STOP"): "tests/control/test_core_startup.py::test_a_stop_on_the_way_ends_it",
     ("control.stop", "STOP"): "tests/control/test_core_stops.py::test_nothing_moves_the_robot_any_more",
     ("control.load_shedding", "STOP"): (
@@ -163,7 +169,7 @@ def ways(make: Callable[[], Entrance], ask: Callable[[Entrance], Callable[[], ob
     for walls in ((), (CAGE,)):
         entrance = make()
         try:
-            run = entrance.launch(*walls)
+            run = entrance.launch(UNGUARDED, *walls)
             entrance.prepare()
             begun = len(run.commands)
             run.ticks(1, ask(entrance))
@@ -189,10 +195,26 @@ def check_tool(name: str) -> None:
 
 def check_world(entrance: Entrance, cell: str) -> None:
     assert cell == "checked"
-    run = entrance.launch(WALL)
+    run = entrance.launch(UNGUARDED, WALL)
     ask_once(entrance, 200)
     farthest = max(command[entrance.column] for command in run.commands)
     assert farthest < FAR - 0.01, f"went to {farthest:.2f} rad, behind the wall from {FAR} rad on"
+
+
+def check_guard(entrance: Entrance, cell: str) -> None:
+    """No command comes a millimetre nearer to a wall around the tool than the margin."""
+    assert cell == "stops"
+    run = entrance.launch(CAGE)
+    entrance.prepare()
+    run.ticks(1, entrance.ask)
+    run.ticks(250, entrance.ask if entrance.streams else lambda: None)
+    session = run.session
+    options = session.config.control.guard.options
+    arm = may_touch_arm(session.config.robot, session.log)
+    checks = Collisions(arm, observed_world(session.bus).world, arm.joint_names, padding=options.margin - 0.001)
+    commands = np.array(run.commands)
+    hit = checks.first_hit(commands)
+    assert hit == len(commands), [str(each) for each in checks.contacts(commands[hit])]
 
 
 def check_silence(entrance: Entrance, cell: str) -> None:
@@ -300,7 +322,7 @@ def check_elsewhere(test: str) -> None:
 CHECKS: Mapping[str, Callable[[Entrance, str], None]] = dict(
     zip(
         COLUMNS,
-        (check_world, check_silence, check_time, check_numbers, check_stop, check_older, check_death),
+        (check_world, check_guard, check_silence, check_time, check_numbers, check_stop, check_older, check_death),
         strict=True,
     )
 )

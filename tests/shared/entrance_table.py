@@ -10,7 +10,7 @@ import attrs
 
 PAGE = Path(__file__).parents[2] / "docs" / "explanation" / "safety.md"
 HEADING = "## Every entrance to motion"
-COLUMNS = ("world", "silence", "time", "numbers", "STOP", "older", "caller dies")
+COLUMNS = ("world", "guard", "silence", "time", "numbers", "STOP", "older", "caller dies")
 
 
 @attrs.frozen

@@ -65,6 +65,7 @@ CAGE = (
 FAR, FARTHEST = 1.2, 1.9
 """Where entrances ask for, from 0 [rad]: near enough for a second, and too far for one."""
 EMPTY = "simulation.scene={type: empty}"
+UNGUARDED = "control.guard=null"
 _PATIENCE_S = 10.0
 
 

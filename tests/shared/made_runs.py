@@ -66,6 +66,10 @@ def contract(cameras: Collection[str] = CAMERAS) -> Contract:
 _STILL = (0.0, 0.0, 0.0)
 
 
+APART = '{"first": "gripper", "second": "bin", "distance": 0.0031, "text": "gripper was 3.1 mm from bin"}'
+"""What the guard says."""
+
+
 @attrs.frozen(kw_only=True)
 class Run:
     """How a run goes; by default well."""
@@ -264,7 +268,7 @@ class _Maker:
         operated = run.takeover[0] * run.seconds <= t_s < run.takeover[1] * run.seconds
         held = run.guarded[0] * run.seconds <= t_s < run.guarded[1] * run.seconds
         if held != self._held:
-            yield GUARD, String('{"first": "gripper", "second": "bin", "distance": 0.0031}' if held else "")
+            yield GUARD, String(APART if held else "")
         self._held = held
         if run.pause[0] and t_s >= self._paused_until and tick and tick % int(run.pause[0] * CONTROL_HZ) == 0:
             self._paused_until = t_s + run.pause[1]

@@ -80,11 +80,15 @@ class Mjcf:
     def solid(self) -> Any:
         """mujoco.MjModel with shapes; bodies without collision geometry have the hulls of their visible meshes."""
         spec = self.spec.copy()
-        for body in spec.bodies:
-            if not any(geom.contype or geom.conaffinity for geom in body.geoms):
-                for geom in body.geoms:
-                    geom.contype = 1  # makes the compiler compute its hull
+        for body in _only_visible(spec):
+            for geom in body.geoms:
+                geom.contype = 1  # makes the compiler compute its hull
         return self._compiled(spec)
+
+    @property
+    def only_visible(self) -> tuple[str, ...]:
+        """Bodies with shapes of which none can collide."""
+        return tuple(body.name for body in _only_visible(self.spec))
 
     def tree(self, model: Any, joints: Iterable[str]) -> JointTree:
         """The tree of some joints in `skeleton` or `solid`. Others stay at their reference position.
@@ -247,6 +251,12 @@ def several_arms(path: Path, arms: Mapping[str, Sequence[float]]) -> Any:
 def mesh_name(mesh: Any) -> str:
     """The name by which geoms of a mujoco.MjSpec refer to a mesh."""
     return mesh.name or Path(mesh.file).stem
+
+
+def _only_visible(spec: Any) -> list[Any]:
+    return [
+        body for body in spec.bodies if body.geoms and not any(geom.contype or geom.conaffinity for geom in body.geoms)
+    ]
 
 
 def robot_model(robot: Robot, joints: Sequence[str] | None = None) -> KinematicModel:

@@ -10,7 +10,7 @@ from ibrobot_core.app import Command, Kind, SectionDescriptor, SourceDescriptor
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
 from ibrobot_planning.guard.descriptor import GuardDescriptor
 from ibrobot_planning.guard.options import ClearanceGuardOptions
-from ibrobot_planning.guard.unsaid import GuardNotice, unsaid
+from ibrobot_planning.guard.unsaid import unsaid
 from ibrobot_planning.planner import PlannerDescriptor
 from ibrobot_planning.planners.options import GoalCheckOptions, JointPlannerOptions, RrtConnectOptions
 from ibrobot_planning.world.engines import find_engines
@@ -59,9 +59,10 @@ def ibrobot_guards() -> Iterable[GuardDescriptor]:
     )
 
 
-def _feeds_guard(config: RobotConfig) -> bool:
+def _feed(config: RobotConfig) -> str:
     guard = config.control.guard
-    return guard is not None and guard.type == "clearance" and "world" in config.plugin_sections
+    fed = guard is not None and guard.type == "clearance" and "world" in config.plugin_sections
+    return "ibrobot_planning.guard.feed:GuardFeed" if fed else "ibrobot_planning.guard.notice:GuardNotice"
 
 
 @hookimpl
@@ -126,15 +127,10 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
     )
     yield SectionDescriptor(
         type="guard_feed",
-        make=lambda options, session: Late("ibrobot_planning.guard.feed:GuardFeed")(session),
-        without_section=_feeds_guard,
-        summary="tells the guard of changes of the world; runs by itself with `control.guard` and `world`",
-    )
-    yield SectionDescriptor(
-        type="guarded",
-        make=lambda options, session: GuardNotice(session),
+        make=lambda options, session: Late(_feed(session.config))(session),
         without_section=lambda config: config.robot.description.mjcf is not None,
-        summary="says at the start what commands are guarded against; runs by itself with a model of the arm",
+        summary="says at the start what commands are guarded against, and tells the guard of changes of the world; runs"
+        " by itself for robots with an MJCF",
     )
     yield SectionDescriptor(
         type="tasks",

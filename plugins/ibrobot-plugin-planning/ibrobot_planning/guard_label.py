@@ -7,7 +7,8 @@ import json
 
 def in_words(label: str) -> str:
     """A label of the guard for people."""
-    return str(json.loads(label)["text"])
+    read: str = json.loads(label)["text"]
+    return read
 
 
 def touches(label: str) -> bool:

@@ -138,7 +138,7 @@ def test_what_the_guard_holds_back_is_no_grasp(allowed: bool) -> None:
     jaw = Jaw(start=1.0, blocked_at=0.6, velocity=2.0, stall_time=0.2, allow_stalling=allowed)
     jaw.close(0.0)
     for _ in range(60):
-        jaw.executor.note_guard('{"first": "finger", "second": "wall", "distance": 0.0031}')
+        jaw.executor.note_guard('{"distance": 0.0031, "text": "finger was 3.1 mm from wall"}')
         jaw.run(0.01)
     status = jaw.statuses()[-1]
     assert (status.state, status.message) == (GoalState.ABORTED, "the guard: finger was 3.1 mm from wall")
@@ -149,7 +149,7 @@ def test_a_grasp_that_the_guard_keeps_from_squeezing_more_is_one() -> None:
     jaw = Jaw(start=1.0, blocked_at=0.6, velocity=2.0, stall_time=0.2)
     jaw.close(0.0)
     for _ in range(60):
-        jaw.executor.note_guard('{"first": "cube", "second": "finger", "distance": -0.0098}')
+        jaw.executor.note_guard('{"distance": -0.0098, "text": "cube was -9.8 mm from finger"}')
         jaw.run(0.01)
     assert jaw.statuses()[-1].state == GoalState.SUCCEEDED
 

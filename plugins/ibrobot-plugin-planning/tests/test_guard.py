@@ -20,7 +20,8 @@ import pytest
 from ibrobot_planning.guard.changes import WorldChange
 from ibrobot_planning.guard.clearance_guard import ClearanceGuard
 from ibrobot_planning.guard.feed import GuardFeed
-from ibrobot_planning.guard.options import ClearanceGuardOptions
+from ibrobot_planning.guard.options import ClearanceGuardOptions, RegionOptions
+from ibrobot_planning.world.arm import robot_arm
 from ibrobot_planning.world.objects import (
     OBSERVED,
     Box,
@@ -55,9 +56,11 @@ class Loop:
         *,
         guarded: bool = True,
         clock: Clock | None = None,
+        described: dict[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        self.robot: Robot = make_robot(folder)
+        robot: Robot = make_robot(folder)
+        self.robot = attrs.evolve(robot, description=attrs.evolve(robot.description, **(described or {})))
         context = Context(
             "guard", clock or SteppedClock(7), logging.getLogger("test"), self.robot, self.robot.joint_names
         )
@@ -256,6 +259,101 @@ def test_permissions_of_the_world_count(tmp_path) -> None:
     links = ("upper", "lower", "wrist", "hand", "finger")
     loop.world({"wall": attrs.evolve(WALL["wall"], may_touch=links)})
     assert loop.go(ACROSS) == pytest.approx(ACROSS)
+
+
+def reached(loop: Loop, thing: WorldObject) -> bool:
+    """Whether commands lead the arm across where the object stands."""
+    loop.go(LEFT)
+    loop.world({"thing": thing})
+    return bool(np.allclose(loop.go(ACROSS), ACROSS))
+
+
+def hand_on_the_way(folder: Path) -> Vector3:
+    """Where the fingers are in the middle of the way across [m]."""
+    placed = robot_arm(make_robot(folder)).link_pose("hand", (LEFT + ACROSS) / 2)
+    return Vector3(*map(float, placed[:3, 3] + 0.05 * placed[:3, 2]))
+
+
+LOW, HIGH = (-0.5, -0.5, -0.1), (0.5, 0.5, 0.5)
+
+
+def test_by_default_the_hand_may_touch_what_is_movable_and_nothing_else_may(tmp_path) -> None:
+    cube = WorldObject(Box((0.02, 0.02, 0.02)), Pose(hand_on_the_way(tmp_path)))
+    assert not reached(Loop(tmp_path, LEFT), cube)
+    assert reached(Loop(tmp_path, LEFT), attrs.evolve(cube, movable=True))
+    assert not reached(Loop(tmp_path, LEFT, free={}), attrs.evolve(cube, movable=True))
+    arm_in_the_way = attrs.evolve(WALL["wall"], movable=True)
+    assert not reached(Loop(tmp_path, LEFT), arm_in_the_way)
+
+
+def test_by_default_the_hand_presses_on_the_floor_of_the_description(tmp_path) -> None:
+    down = np.array([0.0, 1.4, 1.2, 0.5, 0.0, 0.0])
+    lowest = {}
+    for name, options in (("hand", {}), ("nothing", {"may_touch": {}})):
+        loop = Loop(tmp_path, described={"floor": 0.0}, **options)
+        lowest[name] = Seen({}, floor=True).distance(loop.go(down))
+    assert -0.011 < lowest["hand"] < -0.008
+    assert lowest["nothing"] > 0.002
+
+
+@pytest.mark.parametrize(
+    ("region", "touches"),
+    [
+        ({"lower": LOW, "upper": HIGH}, True),
+        ({"lower": LOW, "upper": HIGH, "links": ("hand", "finger")}, True),
+        ({"lower": LOW, "upper": HIGH, "links": ("hand",)}, False),
+        ({"lower": LOW, "upper": (0.5, 0.5, 0.1)}, False),  # the object reaches beyond it
+    ],
+)
+@pytest.mark.parametrize("kind", ["box", "mesh", "voxels"])
+def test_what_lies_in_a_region_may_be_touched(tmp_path, kind: str, region: dict[str, Any], touches: bool) -> None:
+    place = hand_on_the_way(tmp_path)
+    cells = np.array(list(itertools.product((-1, 0), repeat=3)))
+    corners = np.array(list(itertools.product((-0.01, 0.01), repeat=3)))
+    shape: Any = {
+        "box": Box((0.02, 0.02, 0.02)),
+        "mesh": Mesh(corners, np.array([[0, 1, 2], [5, 6, 7], [0, 5, 6]]), convex=True),
+        "voxels": Voxels(0.01, cells),
+    }[kind]
+    if not touches and "links" not in region:
+        region = {**region, "upper": (0.5, 0.5, place.z)}
+    loop = Loop(tmp_path, LEFT, regions={"tray": RegionOptions(**region)})
+    assert reached(loop, WorldObject(shape, Pose(place))) == touches
+
+
+def test_an_object_that_leaves_a_region_may_be_touched_no_more(tmp_path) -> None:
+    place = hand_on_the_way(tmp_path)
+    cube = WorldObject(Box((0.02, 0.02, 0.02)), Pose(place))
+    upper = (0.5, 0.5, place.z + 0.011)
+    loop = Loop(tmp_path, LEFT, regions={"tray": RegionOptions(LOW, upper)})
+    assert reached(loop, cube)
+    higher = attrs.evolve(cube, pose=Pose(attrs.evolve(place, z=place.z + 0.004)))
+    assert not reached(loop, higher)
+    assert reached(loop, cube)
+
+
+def test_cells_of_a_cloud_beyond_a_region_still_count(tmp_path) -> None:
+    """The hand sweeps through the cells in the region; those of the wall stay an obstacle."""
+    place = hand_on_the_way(tmp_path)
+    inside = np.floor(np.array([[place.x, place.y, place.z]]) / 0.02).astype(np.int64)
+    wall = np.array([[x, 2, z] for x in range(3, 12) for z in range(4, 16)])
+    tray = RegionOptions(tuple(0.02 * inside[0]), tuple(0.02 * (inside[0] + 1)))
+    loop = Loop(tmp_path, LEFT, regions={"tray": tray})
+    assert reached(loop, WorldObject(Voxels(0.02, inside)))
+    assert not reached(loop, WorldObject(Voxels(0.02, np.concatenate([inside, wall]))))
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "fault"),
+    [
+        ((0, 0, 0), (1, 0, 1), "must be below"),
+        ((0, 0, math.nan), (1, 1, 1), "numbers from"),
+        ((0, 0, 0), (1, 1, 1e9), "numbers from"),
+    ],
+)
+def test_regions_that_are_none_are_refused(lower, upper, fault: str) -> None:
+    with pytest.raises(ValueError, match=fault):
+        RegionOptions(lower, upper)
 
 
 def test_a_carried_object_is_part_of_the_arm(tmp_path) -> None:

@@ -543,7 +543,7 @@ def test_what_is_given_out_is_the_callers_to_change() -> None:
 class TestGuard:
     """What the guard holds back is not reached: the goal ends, and says why."""
 
-    LABEL = '{"first": "hand", "second": "wall", "distance": 0.0031}'
+    LABEL = '{"first": "hand", "second": "wall", "distance": 0.0031, "text": "hand was 3.1 mm from wall"}'
 
     def hold_back(self, arm: Arm, ticks: int, label: str = LABEL) -> None:
         for _ in range(ticks):
@@ -566,7 +566,7 @@ class TestGuard:
     def test_a_stale_world_is_named(self) -> None:
         arm = Arm()
         arm.go(goal(point(2.0, (0.5, 0.5))))
-        self.hold_back(arm, 20, '{"first": "world", "second": "cloud top is 2 s old", "distance": null}')
+        self.hold_back(arm, 20, '{"distance": null, "text": "world: cloud top is 2 s old"}')
         assert arm.statuses()[-1].message == "the guard: world: cloud top is 2 s old"
 
     def test_a_short_hold_passes(self) -> None:

@@ -116,10 +116,9 @@ def _guard(session: RunView) -> dict[str, Any]:
     try:
         read = json.loads(label or "{}")
         if read:
-            first, second, away = (read[name] for name in ("first", "second", "distance"))
-            text = f"{first}: {second}" if away is None else f"{first} was {1e3 * away:.1f} mm from {second}"
-            read = {"first": str(first), "second": str(second), "text": text}
-    except (LookupError, TypeError, ValueError):
+            sound = {"sound": True} if read.get("sound") else {}
+            read = {**{name: str(read[name]) for name in ("first", "second", "text")}, **sound}
+    except (AttributeError, LookupError, TypeError, ValueError):
         read = {"text": label}
     return dict(read)
 

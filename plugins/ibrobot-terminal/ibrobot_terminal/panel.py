@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, override
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, override
 
 import numpy as np
 from rich.console import ConsoleOptions, Group, RenderableType, RenderResult
@@ -13,13 +14,14 @@ from rich.progress_bar import ProgressBar
 from rich.segment import Segment
 from rich.table import Table
 
+from ibrobot_core.api import String
 from ibrobot_core.app import styled
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
-    from ibrobot_core.app import RunDisplay
+    from ibrobot_core.app import RunDisplay, RunView
 
 KEYS = {"Esc": "emergency stop", "F10": "reset", "Ctrl-C": "end"}
 _LOG_LINES = 6
@@ -55,11 +57,13 @@ def panel(
         )
         for key, name in session.mode_keys.items()
     )
+    apart = kept_apart(session)
     # A device moves nothing while the robot holds.
     source = "" if session.faults or session.held else session.command_source.help()
     return Group(  # `Live` cuts off what does not fit
         styled(" ").join(styled(key, "bold reverse") + styled(f" {does}", "bold") for key, does in KEYS.items()),
         *_faults(display),
+        *([styled(f"the guard holds the arm back: {apart['text']}", "yellow")] if apart else ()),
         *_rows(more),
         _Newest(tuple(log.lines)),  # other threads log while it is drawn
         modes,
@@ -67,6 +71,31 @@ def panel(
         *_rows(_facts(display)),
         _Joints(display),
     )
+
+
+def kept_apart(session: RunView) -> dict[str, Any]:
+    """What the guard of control keeps apart now, by the newest message on `/guard`; empty if it lets commands pass."""
+    newest = session.bus.latched().get("/guard")
+    label = newest.message.data if newest is not None and isinstance(newest.message, String) else ""
+    try:
+        read = json.loads(label or "{}")
+        return {"text": str(read["text"]), "sound": bool(read.get("sound"))} if read else {}
+    except (LookupError, TypeError, ValueError, AttributeError):
+        return {"text": label, "sound": False}
+
+
+class GuardBell:
+    """Rings when the guard begins to hold the arm back, and for each other thing, if its option `sound` asks for it."""
+
+    def __init__(self, console: Console) -> None:
+        self._console, self._heard = console, ""
+
+    def hear(self, apart: Mapping[str, Any]) -> None:
+        """Take in what the guard keeps apart, as of `kept_apart`."""
+        text = apart.get("text", "")
+        if apart.get("sound") and text != self._heard:
+            self._console.bell()
+        self._heard = text
 
 
 def _rows(rows: Iterable[tuple[str, str]]) -> list[Text]:

@@ -15,7 +15,7 @@ from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import RunDisplay, RunTerminal, Screen
 from ibrobot_terminal.held_keys import RELEASE, REPEAT
 from ibrobot_terminal.key_reader import KeyReader
-from ibrobot_terminal.panel import RecentLog, panel
+from ibrobot_terminal.panel import GuardBell, RecentLog, kept_apart, panel
 
 if TYPE_CHECKING:
     from ibrobot_core.app import RunHooks, Runtime
@@ -41,6 +41,7 @@ class Panel(RunDisplay):
         self.log: RecentLog = RecentLog()
         self._live = stack.enter_context(Live(console=Screen(stderr=err), auto_refresh=False, screen=False))
         self._next_s = 0.0
+        self._bell = GuardBell(self._live.console)
         self._pressed: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
         """Keys, each with the number of emergency stops when it was pressed."""
         self._acts: queue.SimpleQueue[tuple[str, Callable[[], object]] | None] = queue.SimpleQueue()
@@ -67,6 +68,7 @@ class Panel(RunDisplay):
         self._next_s = time.monotonic() + 1.0 / _PANEL_HZ
         self.handle_keys()
         self.sample()
+        self._bell.hear(kept_apart(self.session))
         rows = [*([("now", f"{acting} …")] if (acting := self._acting) else ()), *self._hooks.rows()]
         self._live.update(panel(self, self.log, self._hooks.help(), rows), refresh=True)
 

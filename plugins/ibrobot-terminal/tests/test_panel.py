@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import io
+import json
 import logging
 from typing import TYPE_CHECKING
 
 import attrs
 import pyte
 import pytest
-from ibrobot_terminal.panel import RecentLog, panel
+from ibrobot_terminal.panel import GuardBell, RecentLog, panel
 from rich.live import Live
 
+from ibrobot_core.api import String
 from ibrobot_core.app import RunDisplay, Screen
 
 if TYPE_CHECKING:
@@ -186,3 +188,29 @@ def test_a_wide_terminal_shows_all_facts(runs: Runs):
         "grip",
     ):
         assert fact in shown, shown
+
+
+APART = {"first": "hand", "second": "wall", "distance": 0.0031, "text": "hand was 3.1 mm from wall"}
+
+
+def test_what_the_guard_keeps_apart_is_seen_until_it_lets_go(terminal: Terminal) -> None:
+    bus = terminal.run.session.bus
+    said = "the guard holds the arm back: hand was 3.1 mm from wall"
+    bus.publish("/guard", String(json.dumps(APART)), latched=True)
+    assert said in terminal.words()
+    bus.publish("/guard", String(""), latched=True)
+    assert "guard" not in terminal.words()
+
+
+@pytest.mark.parametrize("label", ["something near", "[1]", "3", '{"first": "x"}', "{"])
+def test_a_label_of_a_guard_that_is_no_json_is_seen_as_it_is(terminal: Terminal, label: str) -> None:
+    terminal.run.session.bus.publish("/guard", String(label), latched=True)
+    assert f"the guard holds the arm back: {label}" in terminal.words()
+
+
+def test_the_bell_rings_once_for_each_thing_if_the_guard_asks_for_it() -> None:
+    sent = io.StringIO()
+    bell = GuardBell(Screen(file=sent, force_terminal=True))
+    for text, sounds in (("a", True), ("a", True), ("b", True), ("c", False), ("", False), ("b", True)):
+        bell.hear({"text": text, "sound": sounds} if text else {})
+    assert sent.getvalue() == 3 * "\a"

@@ -49,6 +49,9 @@ class ClearanceGuard(Guard):
     def __init__(self, options: ClearanceGuardOptions, context: Context) -> None:
         self._options = options
         self._arm: Arm = may_touch_arm(context.robot, context.log)
+        if self._arm.only_visible:
+            links = ", ".join(self._arm.only_visible)
+            context.log.info("the guard takes hulls of visible meshes for links without collision geometry: %s", links)
         period_s = seconds(context.period_ns)
         self._period_s = period_s
         self._change: Vector = context.robot.max_acceleration * period_s**2
@@ -59,9 +62,7 @@ class ClearanceGuard(Guard):
         empty = self._permissions.applied(World())
         self._pairs = self._made(empty)
         in_thread = not isinstance(context.clock, SteppedClock)
-        self._building = Building(
-            self._arm, self._permissions.applied, self._made, context.log, in_thread=in_thread
-        )
+        self._building = Building(self._arm, self._permissions.applied, self._made, context.log, in_thread=in_thread)
         self._stale = self._label = ""
         self._pair: tuple[str, ...] = ()
         """What the last setpoint was about to touch."""
@@ -102,7 +103,7 @@ class ClearanceGuard(Guard):
         self._pair = ()
         if self._stale and self._options.when_stale == "hold" and not np.array_equal(setpoint, brakes):
             self._counts["stale"] += 1
-            self.overruled = _label("world", self._stale, None)
+            self.overruled = self._said("world", self._stale, None)
             return brakes
         extra = self._pairs.levers @ self._away
         blocking = self._blocking(position, setpoint, extra)
@@ -113,7 +114,7 @@ class ClearanceGuard(Guard):
         self._pair = self._pairs.names[nearest]
         if self._pair != before:
             alike = np.flatnonzero([names == self._pair for names in self._pairs.names])
-            self._label = _label(*self._pair, float(self._pairs.distances(position, alike).min()))
+            self._label = self._said(*self._pair, float(self._pairs.distances(position, alike).min()))
         self.overruled = self._label
         lowest, highest = np.minimum(brakes, setpoint), np.maximum(brakes, setpoint)
         for _ in range(_ROUNDS):
@@ -207,9 +208,9 @@ class ClearanceGuard(Guard):
         made.estimate(self._begin)
         return made
 
-
-def _label(first: str, second: str, distance: float | None) -> str:
-    """As `overruled`: two things and their distance [m], or `world` and why it is not known well enough."""
-    away = None if distance is None else round(distance, 4)
-    text = f"{first}: {second}" if away is None else f"{first} was {1000 * away:.1f} mm from {second}"
-    return json.dumps({"first": first, "second": second, "distance": away, "text": text})
+    def _said(self, first: str, second: str, distance: float | None) -> str:
+        """As `overruled`: two things and their distance [m], or `world` and why it is not known well enough."""
+        away = None if distance is None else round(distance, 4)
+        text = f"{first}: {second}" if away is None else f"{first} was {1000 * away:.1f} mm from {second}"
+        label = {"first": first, "second": second, "distance": away, "text": text}
+        return json.dumps({**label, "sound": True} if self._options.sound else label)

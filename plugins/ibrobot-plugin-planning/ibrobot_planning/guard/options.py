@@ -60,6 +60,7 @@ class ClearanceGuardOptions(Options):
         "hold",
         help="when a part of the world is too old, whose own rule is `refuse`: brake and hold, or keep what was seen",
     )
+    sound: bool = option(False, help="ring the terminal's bell, and sound on the page, when it begins to hold back")
 
     def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
         """Check that the robot has a model."""

@@ -1,14 +1,12 @@
-"""The guard of robots whose YAML does not mention one, and what a run says of its guard at the start."""
+"""The guard of robots whose YAML does not mention one."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any, override
+from typing import Any
 
 from ibrobot_core.api import MissingDependency
-from ibrobot_core.app import Component, RobotConfig, RunView
-from ibrobot_planning.guard.options import ClearanceGuardOptions
 from ibrobot_planning.world.engines import find_engines
 
 _TYPE = "clearance"
@@ -50,41 +48,3 @@ def _at(value: Any, *keys: str) -> Any:
     for key in keys:
         value = value.get(key) if isinstance(value, Mapping) else None
     return value
-
-
-class GuardNotice(Component):
-    """Says at the start of a run what its commands are guarded against."""
-
-    def __init__(self, session: RunView) -> None:
-        super().__init__("guarded", notice(session.config))
-        self._session = session
-
-    @override
-    def start(self) -> None:
-        self._session.log.info("%s", self.summary)
-
-    @override
-    def stop(self) -> None:
-        pass
-
-
-def notice(config: RobotConfig) -> str:
-    """What the commands of a robot are guarded against."""
-    guard = config.control.guard
-    if guard is not None:
-        if not isinstance(guard.options, ClearanceGuardOptions):
-            return f"the guard {guard.type} checks all commands"
-        options = guard.options
-        floor = config.robot.description.floor if options.floor is None else options.floor
-        things = [] if floor is None else [f"the table at {floor:g} m"]
-        things += ["the section world"] if "world" in config.plugin_sections else []
-        around = f"{1e3 * options.margin:g} mm from {' and '.join(things)}, " if things else ""
-        return f"all commands keep {around}{1e3 * options.self_margin:g} mm between links (control.guard: null: off)"
-    why = "control.guard is null"
-    if "guard" not in (config.document.get("control") or {}):
-        why = "set robot.description.floor to the height of the table"
-        try:
-            find_engines()
-        except MissingDependency as error:
-            why = str(error)
-    return f"no guard: commands of programs and devices may lead into the arm itself or the table: {why}"

@@ -72,6 +72,8 @@ class Arm:
     """Pairs of links that may touch, with the reason; see `unchecked_pairs`."""
     urdf_links: Mapping[str, str] = attrs.field(factory=dict)
     """Link of the URDF -> link of the MJCF; empty without a URDF."""
+    only_visible: tuple[str, ...] = ()
+    """Links without collision geometry, of which the visible meshes' hulls count."""
 
     def native(self, q: Vector) -> Vector:
         """Joint positions, shape (..., J), in Pinocchio's order and zero."""
@@ -205,6 +207,7 @@ def read_arm(path: Path, joints: tuple[str, ...], arms: tuple[tuple[str, tuple[f
         frames={source.body(body).name: place for body, place in enumerate(bodies)},
         numbers=np.array(numbers, dtype=np.intp),
         slides=np.array([joint.slides for joint in moving], dtype=bool),
+        only_visible=mjcf.only_visible,
     )
 
 

@@ -15,6 +15,7 @@ import { PlotsPanel } from "./panels/plots.js";
 import { HealthPanel } from "./panels/health.js";
 import { LogPanel } from "./panels/log.js";
 import { words } from "./words.js";
+import { GUARD_HZ, sound } from "./cues.js";
 
 const STALE_MS = 1500;
 const CONFIRMED_MS = 300;
@@ -234,6 +235,8 @@ page.stream.addEventListener("state", ({ detail: state }) => {
 });
 page.stream.addEventListener("status", ({ detail: status }) => {
   const first = !page.status;
+  const { text: held, sound: sounds } = status.guard ?? {};
+  if (sounds && held !== page.status?.guard?.text) sound(GUARD_HZ);
   page.status = status;
   const objects = JSON.stringify(status.objects);
   if (objects !== page.objects) view.tell({ do: "objects", objects: status.objects });

@@ -28,13 +28,22 @@ export class Cues {
   play(cue) {
     if (this.choice.value === "words") window.speechSynthesis.speak(new SpeechSynthesisUtterance(WORDS[cue]));
     if (this.choice.value !== "tones") return;
-    this.context ??= new AudioContext();
-    this.context.resume();
-    TONES_HZ[cue].forEach((frequency, i) => {
-      const tone = new OscillatorNode(this.context, { frequency }), volume = new GainNode(this.context, { gain: LOUD });
-      tone.connect(volume).connect(this.context.destination);
-      tone.start(this.context.currentTime + i * STEP_S);
-      tone.stop(this.context.currentTime + i * STEP_S + TONE_S);
-    });
+    sound(TONES_HZ[cue]);
   }
+}
+
+// What the operator hears when the guard begins to hold the arm back, if its option `sound` asks for it.
+export const GUARD_HZ = [440, 330];
+let context;
+
+// Plays tones one after another; a browser is silent until the page was clicked or a key was pressed.
+export function sound(frequencies) {
+  context ??= new AudioContext();
+  context.resume();
+  frequencies.forEach((frequency, i) => {
+    const tone = new OscillatorNode(context, { frequency }), volume = new GainNode(context, { gain: LOUD });
+    tone.connect(volume).connect(context.destination);
+    tone.start(context.currentTime + i * STEP_S);
+    tone.stop(context.currentTime + i * STEP_S + TONE_S);
+  });
 }

@@ -1,0 +1,111 @@
+"""Which robots have a guard that their YAML does not mention, and what a run says of it."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from ibrobot_planning.guard import notice as notices
+from ibrobot_planning.guard import unsaid as unsaids
+from ibrobot_planning.guard.unsaid import unsaid
+
+from ibrobot_core.api import MissingDependency
+from ibrobot_core.app import RobotConfig
+
+from .conftest import Make
+from .test_motion import robot_yaml
+
+MODEL = {"robot": {"description": {"mjcf": "arm.xml"}}}
+FLOOR = "robot.description.floor=0.1"
+
+
+def with_floor(floor: Any) -> dict[str, Any]:
+    return {"robot": {"description": {"mjcf": "arm.xml", "floor": floor}}}
+
+
+@pytest.mark.parametrize(
+    ("document", "guard"),
+    [
+        ({}, None),
+        (MODEL, None),
+        ({"robot": {"description": {"floor": 0.0}}}, None),
+        (with_floor(0.0), {"type": "clearance"}),
+        ({**with_floor(0.0), "goals": {"floor": 0.2}}, {"type": "clearance"}),
+        ({**MODEL, "goals": {"floor": 0.2}}, {"type": "clearance", "floor": 0.2}),
+        ({**MODEL, "world": {"scene": True}}, {"type": "clearance"}),
+        ({**MODEL, "world": {}}, None),
+        (
+            {**MODEL, "control_modes": {"a": {"planner": {"floor": 0.2}}, "b": {"planner": {"floor": -0.1}}, "c": {}}},
+            {"type": "clearance", "floor": -0.1},
+        ),
+        ({**MODEL, "control_modes": {"a": {"planner": "joint"}}}, None),
+        ({**with_floor(0.0), "control": {"guard": None}}, None),
+        ({**with_floor(0.0), "control": {"guard": {"type": "other"}}}, None),
+        ({**with_floor(0.0), "control": {"rate_hz": 50}}, {"type": "clearance"}),
+        ({**with_floor(0.0), "control": 3}, None),
+        (with_floor("high"), None),
+        (with_floor(float("nan")), None),
+    ],
+)  # fmt: skip
+def test_a_model_and_a_table_make_a_guard(document: dict[str, Any], guard: dict[str, Any] | None) -> None:
+    assert unsaid(document) == guard
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.text(max_size=3),
+    lambda inner: st.lists(inner, max_size=2) | st.dictionaries(st.sampled_from(("floor", "planner", "x")), inner),
+    max_leaves=6,
+)
+
+
+@given(st.dictionaries(st.sampled_from(("robot", "control", "control_modes", "goals", "world")), VALUES))
+def test_documents_of_any_kind_make_none_or_a_guard(document: dict[str, Any]) -> None:
+    assert unsaid(document) is None  # none of them has a model
+
+
+def said(make: Make, caplog: pytest.LogCaptureFixture, *overrides: str, text: str) -> tuple[RobotConfig, str]:
+    """The config of a run, and what it says of its guard at the start."""
+    with caplog.at_level(logging.INFO):
+        run = make(*overrides, text=text)
+        run.start()
+    lines = [record.message for record in caplog.records if "guard" in record.message and "hulls" not in record.message]
+    assert len(lines) == 1
+    return run.session.config, lines[0]
+
+
+class TestRun:
+    def test_a_table_is_enough(self, make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+        config, line = said(make, caplog, FLOOR, text=robot_yaml(tmp_path))
+        assert config.control.guard is not None
+        assert line == "all commands keep 3 mm from the table at 0.1 m, 1 mm between links (control.guard: null: off)"
+        assert config.document["control"]["guard"] == {"type": "clearance"}, "recordings have it"
+
+    def test_one_key_switches_it_off(self, make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+        config, line = said(make, caplog, FLOOR, "control.guard=null", text=robot_yaml(tmp_path))
+        assert config.control.guard is None
+        assert line.startswith("no guard: ")
+        assert line.endswith("control.guard is null")
+
+    def test_without_a_table_it_says_what_to_set(
+        self, make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        config, line = said(make, caplog, text=robot_yaml(tmp_path))
+        assert config.control.guard is None
+        assert line.endswith("set robot.description.floor to the height of the table")
+
+    def test_without_the_engines_it_says_what_to_install(
+        self, make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def missing() -> None:
+            raise MissingDependency("needs coal", remedy="pip install coal")
+
+        for module in (unsaids, notices):
+            monkeypatch.setattr(module, "find_engines", missing)
+        text = robot_yaml(tmp_path)
+        config, line = said(make, caplog, FLOOR, "default_control_mode=idle", text=text)
+        assert config.control.guard is None
+        assert line.endswith("needs coal; pip install coal")
