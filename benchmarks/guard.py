@@ -1,6 +1,6 @@
 """Whether the guard keeps arms out of themselves and the world, whoever commands, by MuJoCo's collision detection.
 
-    python benchmarks/guard.py [--commands 30000] [--trials 200] [--arms so101 …] [--processes 2] [--seed 0]
+    python benchmarks/guard.py [--commands 30000] [--trials 200] [--outs 200] [--arms so101 …] [--kinds commanded …]
 
 An SO-101, two of them, and a UR5 and an FR3 made from their URDFs, on a table. Five kinds of commands take turns (a
 policy, a leader, limits, twists, trajectories), most of them aimed at configurations in contact, while posts, bars,
@@ -63,8 +63,8 @@ def trial(task: tuple[Path, str, str, int]) -> tuple[str, str, Any, float]:
 def seeds(kind: str, asked: argparse.Namespace) -> range:
     """Of each arm."""
     starts = asked.commands / TICKS
-    count = {"commanded": starts, "without": starts / 10, "simulated": starts / 20}.get(kind, asked.trials)
-    return range(asked.seed, asked.seed + max(1, round(count / len(asked.arms))))
+    counts = {"commanded": starts, "without": starts / 10, "simulated": starts / 20, "backs_out": asked.outs}
+    return range(asked.seed, asked.seed + max(1, round(counts.get(kind, asked.trials) / len(asked.arms))))
 
 
 def summed(came: list[tuple[str, str, Any, float]]) -> dict[str, Result]:
@@ -89,41 +89,56 @@ def summed(came: list[tuple[str, str, Any, float]]) -> dict[str, Result]:
     return sums
 
 
+def came_to(pool: Any, todo: list[tuple[Path, str, str, int]], kind: str) -> list[tuple[str, str, Any, float]]:
+    """Run trials; what has come of them so far is printed after each hundred."""
+    came = []
+    for each in pool.imap(trial, todo):
+        came.append(each)
+        if len(came) % 100 == 0 and len(came) < len(todo):
+            results = [result for *_, result, _ in came if isinstance(result, Result)]
+            touched, least = sum(result.touched for result in results), min((r.kept for r in results), default=0.0)
+            wrong = sum(bool(result) for *_, result, _ in came if isinstance(result, str))
+            print(
+                f"{kind}: {len(came)} of {len(todo)}, {touched} touch, {1e3 * least:.3f} mm, {wrong} failed", flush=True
+            )
+    return came
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--commands", type=int, default=30_000, help="of all arms together")
-    parser.add_argument("--trials", type=int, default=200, help="of `appears`, and of `backs_out`")
+    parser.add_argument("--trials", type=int, default=200, help="of `appears`")
+    parser.add_argument("--outs", type=int, default=200, help="of `backs_out`")
     parser.add_argument("--arms", nargs="+", default=["so101", "bi_so101", "ur5", "fr3"])
+    parser.add_argument("--kinds", nargs="+", default=KINDS, choices=KINDS)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
     logging.disable()
     sums: dict[str, Result] = {}
-    failed: dict[str, list[str]] = {}
+    figures: dict[str, float] = {}
+    problems = 0
     with tempfile.TemporaryDirectory() as name, multiprocessing.get_context("spawn").Pool(asked.processes) as pool:
         folder = Path(name)
         guard_trials.stations(folder)  # writes the UR5 and the FR3
-        for kind in KINDS:
+        for kind in asked.kinds:
             todo = [(folder, arm, kind, seed) for seed in seeds(kind, asked) for arm in asked.arms]
-            came = list(pool.imap(trial, todo))
+            came = came_to(pool, todo, kind)
             sums |= summed(came)
             if kind in TRIALS:
-                failed[kind] = [f"{arm}: {result}" for arm, _, result, _ in came if result]
-                print(f"{kind:20} {len(came)} trials, {len(failed[kind])} failed", *failed[kind], sep="\n", flush=True)
-    problems = sum(map(len, failed.values()))
-    for what, least in (("commanded", -1e-3), ("simulated", -1e-3), ("measured", -np.inf)):
-        problems += sums[what].touched > 0 or sums[what].kept < least
-    report(
-        commands=sums["commanded"].commands + sums["simulated"].commands,
-        touch=sums["commanded"].touched + sums["simulated"].touched,
-        beyond_margin_mm=1e3 * min(sums["commanded"].kept, sums["simulated"].kept),
-        measured_touch=sums["measured"].touched,
-        without=sums["without"].commands,
-        without_touch=sums["without"].touched,
-        trials=asked.trials,
-        appeared_failed=len(failed["appears"]),
-        not_backed_out=len(failed["backs_out"]),
-    )
+                failed = [f"{arm}: {result}" for arm, _, result, _ in came if result]
+                print(f"{kind:20} {len(came)} trials, {len(failed)} failed", *failed, sep="\n", flush=True)
+                figures |= {kind: len(came), f"{kind}_failed": len(failed)}
+                problems += len(failed)
+    for what, least in (("commanded", -1e-3), ("simulated", -1e-3), ("measured", -np.inf), ("without", None)):
+        if what not in sums:
+            continue
+        each = sums[what]
+        figures |= {what: each.commands, f"{what}_touch": each.touched}
+        if least is not None:
+            problems += each.touched > 0 or each.kept < least
+            figures[f"{what}_beyond_margin_mm"] = 1e3 * each.kept
+    report(**figures)
     return int(problems > 0)
 
 

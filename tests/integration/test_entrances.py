@@ -209,9 +209,10 @@ def check_guard(entrance: Entrance, cell: str) -> None:
     run.ticks(1, entrance.ask)
     run.ticks(250, entrance.ask if entrance.streams else lambda: None)
     session = run.session
-    options = session.config.control.guard.options
+    guard = session.config.control.guard
+    assert guard is not None
     arm = may_touch_arm(session.config.robot, session.log)
-    checks = Collisions(arm, observed_world(session.bus).world, arm.joint_names, padding=options.margin - 0.001)
+    checks = Collisions(arm, observed_world(session.bus).world, arm.joint_names, padding=guard.options.margin - 0.001)
     commands = np.array(run.commands)
     hit = checks.first_hit(commands)
     assert hit == len(commands), [str(each) for each in checks.contacts(commands[hit])]

@@ -289,8 +289,8 @@ def test_by_default_the_hand_may_touch_what_is_movable_and_nothing_else_may(tmp_
 def test_by_default_the_hand_presses_on_the_floor_of_the_description(tmp_path) -> None:
     down = np.array([0.0, 1.4, 1.2, 0.5, 0.0, 0.0])
     lowest = {}
-    for name, options in (("hand", {}), ("nothing", {"may_touch": {}})):
-        loop = Loop(tmp_path, described={"floor": 0.0}, **options)
+    for name, may_touch in (("hand", None), ("nothing", dict[str, tuple[str, ...]]())):
+        loop = Loop(tmp_path, described={"floor": 0.0}, may_touch=may_touch)
         lowest[name] = Seen({}, floor=True).distance(loop.go(down))
     assert -0.011 < lowest["hand"] < -0.008
     assert lowest["nothing"] > 0.002
