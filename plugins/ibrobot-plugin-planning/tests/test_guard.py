@@ -387,7 +387,21 @@ def test_joints_that_stray_from_their_path_widen_the_margin(tmp_path) -> None:
         for _ in range(120):
             loop.tick(ACROSS, loop.position - np.array([offset, 0, 0, 0, 0, 0]))
         at[name] = loop.position[0]
+        said = json.loads(loop.guard.overruled)["text"]
+        assert ("pan was 0.05 rad from its commands" in said) == (offset > 0)
     assert at["offset"] > at["none"] + 0.02
+
+
+def test_a_joint_that_strays_widens_no_margin_of_what_it_does_not_lead_nearer(tmp_path) -> None:
+    """The pan turns about the vertical: however far off it is, the hand comes as near to the table."""
+    down = np.array([0.0, 1.4, 1.2, 0.5, 0.0, 0.0])
+    lowest = []
+    for offset in (0.0, 0.1):
+        loop = Loop(tmp_path, floor=0.0, may_touch={})
+        for _ in range(200):
+            loop.tick(down, loop.position - np.array([offset, 0, 0, 0, 0, 0]))
+        lowest.append(Seen({}, floor=True).distance(loop.position))
+    assert lowest[1] < lowest[0] + 0.005
 
 
 def make_change(kind: str) -> WorldObject:

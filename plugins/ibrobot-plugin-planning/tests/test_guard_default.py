@@ -14,7 +14,7 @@ from ibrobot_planning.guard import unsaid as unsaids
 from ibrobot_planning.guard.unsaid import unsaid
 
 from ibrobot_core.api import MissingDependency
-from ibrobot_core.app import RobotConfig
+from ibrobot_core.app import ConfigError, RobotConfig
 
 from .conftest import Make
 from .test_motion import robot_yaml
@@ -109,3 +109,9 @@ class TestRun:
         config, line = said(make, caplog, FLOOR, "default_control_mode=idle", text=text)
         assert config.control.guard is None
         assert line.endswith("needs coal; pip install coal")
+
+
+def test_a_region_with_a_link_that_is_not_there_is_refused(make: Make, tmp_path: Path) -> None:
+    region = "control.guard={type: clearance, regions: {tray: {lower: [0, 0, 0], upper: [1, 1, 1], links: [hnad]}}}"
+    with pytest.raises(ConfigError, match=r"control\.guard\.regions\.tray\.links\.0: unknown link 'hnad'.*hand"):
+        make(region, text=robot_yaml(tmp_path))

@@ -114,7 +114,8 @@ class ClearanceGuard(Guard):
         self._pair = self._pairs.names[nearest]
         if self._pair != before:
             alike = np.flatnonzero([names == self._pair for names in self._pairs.names])
-            self._label = self._said(*self._pair, float(self._pairs.distances(position, alike).min()))
+            away = float(self._pairs.distances(position, alike).min())
+            self._label = self._said(*self._pair, away, self._strayed(nearest))
         self.overruled = self._label
         lowest, highest = np.minimum(brakes, setpoint), np.maximum(brakes, setpoint)
         for _ in range(_ROUNDS):
@@ -150,7 +151,7 @@ class ClearanceGuard(Guard):
             suspect = suspect[pairs.unproved(position, path[-1], extra, suspect)]
         if not len(suspect):
             return suspect
-        required = pairs.required(position, suspect, extra)
+        required = pairs.required(position, suspect, extra, self._away)
         return pairs.first_blocked(path, suspect, required)
 
     def _path(self, position: Vector, command: Vector) -> Vector:
@@ -208,9 +209,17 @@ class ClearanceGuard(Guard):
         made.estimate(self._begin)
         return made
 
-    def _said(self, first: str, second: str, distance: float | None) -> str:
+    def _strayed(self, pair: int) -> str:
+        """The joint that is off its commands so far that a pair must stay apart by more than twice its margin."""
+        widened = self._pairs.levers[pair] * self._away
+        joint = int(widened.argmax())
+        if widened[joint] <= max(self._options.margin, self._options.self_margin):
+            return ""
+        return f", and {self._arm.joint_names[joint]} was {self._away[joint]:.2f} rad from its commands"
+
+    def _said(self, first: str, second: str, distance: float | None, why: str = "") -> str:
         """As `overruled`: two things and their distance [m], or `world` and why it is not known well enough."""
         away = None if distance is None else round(distance, 4)
-        text = f"{first}: {second}" if away is None else f"{first} was {1000 * away:.1f} mm from {second}"
+        text = f"{first}: {second}" if away is None else f"{first} was {1000 * away:.1f} mm from {second}{why}"
         label = {"first": first, "second": second, "distance": away, "text": text}
         return json.dumps({**label, "sound": True} if self._options.sound else label)

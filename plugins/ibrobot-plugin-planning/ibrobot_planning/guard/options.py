@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Literal
 
 import attrs
 
-from ibrobot_core.api import OptionFault, Options, documented, option
-from ibrobot_planning.world.options import near
+from ibrobot_core.api import OptionFault, Options, did_you_mean, documented, option
+from ibrobot_planning.world.options import link_names, near
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
@@ -63,6 +63,12 @@ class ClearanceGuardOptions(Options):
     sound: bool = option(False, help="ring the terminal's bell, and sound on the page, when it begins to hold back")
 
     def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-        """Check that the robot has a model."""
+        """Check that the robot has a model, and the links that regions name."""
         if robot.description.mjcf is None:
             yield OptionFault((), "the guard needs robot.description.mjcf: set it, or leave control.guard out", "mjcf")
+        known = link_names(robot)
+        for name, region in self.regions.items():
+            for i, link in enumerate(region.links or ()):
+                if known and link not in known:
+                    message = f"unknown link {link!r}{did_you_mean(link, known, 'known')}"
+                    yield OptionFault(("regions", name, "links", i), message)

@@ -154,17 +154,25 @@ class Pairs:
         native = checks.native(q[None])[0]
         pinocchio.updateGeometryPlacements(checks.arm.model, checks.data, self._geometry, self._results, native)
 
-    def required(self, q: Vector, pairs: Indices, extra: Vector) -> Vector:
+    def required(self, q: Vector, pairs: Indices, extra: Vector, strays: Vector) -> Vector:
         """How far pairs must stay apart from now on, if the arm is at `q` [m].
 
         A pair that is nearer than its limit may get farther, and then not come back; so may one that is within `extra`.
+
+        Args:
+            q: joint positions [rad], shape (J,).
+            pairs: the pairs, K in number.
+            extra: distance beyond the limit that each pair should keep [m], shape (P,).
+            strays: how far each joint may be from `q`, of which `extra` is made [rad], shape (J,).
         """
-        now, limits = self.distances(q, pairs), self.limits[pairs]
+        now, limits, extra = self.distances(q, pairs), self.limits[pairs], extra[pairs]
+        if extra.max(initial=0.0) > _SLACK_M:
+            extra = np.minimum(extra, self._approach(strays, pairs, evenly=False))
         # A pair that something else than a command has brought together, e.g. a new object, may part.
         limits = np.where(now < limits - BETWEEN_M - 2 * _SLACK_M, now - _GIVE_M, limits)
         limits = np.maximum(limits, np.minimum(self.margins[pairs], now - _GIVE_M))
         self.limits[pairs] = limits
-        least = np.maximum(limits - _SLACK_M, np.minimum(limits + extra[pairs], now - _GIVE_M))
+        least = np.maximum(limits - _SLACK_M, np.minimum(limits + extra, now - _GIVE_M))
         return np.minimum(least, now)
 
     def first_blocked(self, path: Vector, pairs: Indices, required: Vector) -> Indices:
@@ -203,17 +211,25 @@ class Pairs:
                 todo += [(middle, end, among, needed), (begin, middle, among, needed)]
         return pairs[:0]
 
-    def _approach(self, half: Vector, pairs: Indices) -> Vector:
-        """How much nearer pairs come at most while all joints move evenly by up to `half` forth or back [m].
+    def _approach(self, half: Vector, pairs: Indices, *, evenly: bool = True) -> Vector:
+        """How much nearer pairs come at most while all joints move by up to `half` forth or back [m], shape (K,).
 
         From where they were measured last. A convex pair is at least as far apart as in the direction in which it was
         then; in this direction, each point moves as its bounding sphere does, up to the second order.
+
+        Args:
+            half: the motion of each joint [rad], shape (J,).
+            pairs: the pairs, K in number.
+            evenly: whether they move together, or else each by itself.
         """
         normals, rates, turns = self._rates(pairs, self._centres)
-        along = rates @ half
-        turning = turns @ half
+        if evenly:
+            along, turning = rates @ half, (turns @ half)[..., None]
+        else:
+            along, turning = np.abs(rates) @ np.abs(half), turns * half
         # |w x n| for directions n of length 1.
-        turn = np.sqrt(np.maximum((turning**2).sum(axis=2) - np.einsum("ksc,kc->ks", turning, normals) ** 2, 0.0))
+        across = (turning**2).sum(axis=2) - np.einsum("kscj,kc->ksj", turning, normals) ** 2
+        turn = np.sqrt(np.maximum(across, 0.0)).sum(axis=2)
         swung = turn[:, 0] * self._radii[pairs, 0] + turn[:, 1] * self._radii[pairs, 1]
         curved = np.abs(half).sum() * (self.levers[pairs] @ np.abs(half)) / 2
         approach: Vector = np.where(self._convex[pairs], np.abs(along) + swung + curved, np.inf)

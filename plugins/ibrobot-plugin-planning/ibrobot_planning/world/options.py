@@ -187,20 +187,11 @@ class WorldOptions(Options):
 
     def _unknown_names(self, robot: Robot) -> Iterable[OptionFault]:
         """Faults of names that are neither a link of the robot's model nor an object."""
-        from ibrobot_kinematics.errors import KinematicsError
-        from ibrobot_kinematics.mjcf_names import read_names
-
         from ibrobot_planning.world.objects import FLOOR
 
-        mjcf = robot.description.mjcf
-        if mjcf is None:
+        mjcf, links = robot.description.mjcf, link_names(robot)
+        if mjcf is None or not links:
             return
-        try:
-            model = read_names(mjcf)
-        except KinematicsError:
-            return  # its own check reports it
-        prefixes = tuple(robot.description.arms) or ("",)
-        links = [prefix + name for prefix in prefixes for name in ("world", *model.bodies, *model.sites)]
         known = [*links, *self.objects, *self.clouds, FLOOR]
         for name, thing in self.objects.items():
             if name in links:
@@ -213,6 +204,21 @@ class WorldOptions(Options):
                 if other not in known and not self.scene:  # objects of the scene are checked at the start
                     message = f"unknown link or object {other!r}{did_you_mean(other, known, 'known')}"
                     yield OptionFault(("objects", name, "may_touch", i), message)
+
+
+def link_names(robot: Robot) -> list[str]:
+    """Links and sites of the robot's MJCF; none without one, or if it cannot be read, which its own check reports."""
+    from ibrobot_kinematics.errors import KinematicsError
+    from ibrobot_kinematics.mjcf_names import read_names
+
+    if robot.description.mjcf is None:
+        return []
+    try:
+        model = read_names(robot.description.mjcf)
+    except KinematicsError:
+        return []
+    prefixes = tuple(robot.description.arms) or ("",)
+    return [prefix + name for prefix in prefixes for name in ("world", *model.bodies, *model.sites)]
 
 
 def _short(instance: object, attribute: attrs.Attribute[str], value: str) -> None:
