@@ -85,7 +85,9 @@ class EvalOptions:
         False, label="Open the order", more=True, help="blinded trials: open the order now; no trial can follow"
     )
     out: Path = option(
-        label="Folder", help="folder of results, recordings and report; an evaluation in it is continued"
+        suggest="evaluations/{config}",
+        label="Folder",
+        help="folder of results, recordings and report; an evaluation in it is continued",
     )
 
     @property

@@ -6,6 +6,8 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import attrs
+
 from ibrobot_core.api import Float64MultiArray, IbrobotError, SceneObject, Vector
 from ibrobot_core.app import RobotConfig, RunView, Subscription
 
@@ -36,7 +38,12 @@ class SceneObjects:
         """The objects that are fixed in the base frame, and those of the scene."""
         bus = self._session.bus
         things = bus.call(SHAPES) if bus.serves(SHAPES) else ()
-        known = [place_of(each) for each in things if each.shape != "plane"]
+        colours = {thing.name: thing.color for thing in self._things}  # planners know shapes alone
+        known = [
+            place_of(each if len(each.color) else attrs.evolve(each, color=colours.get(each.name, ())))
+            for each in things
+            if each.shape != "plane"
+        ]
         names = {each["name"] for each in known}
         for topic, subscription in self._topics.items():
             for received in subscription.drain():

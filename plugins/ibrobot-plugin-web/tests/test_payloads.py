@@ -9,6 +9,7 @@ import socket
 from types import SimpleNamespace
 from typing import Any
 
+import attrs
 import numpy as np
 import pytest
 import simplejpeg
@@ -196,4 +197,8 @@ def test_objects_of_a_simulated_scene_are_where_the_simulation_has_them() -> Non
     assert (bin_["pos"], bin_["size"]) == ([1, 2, 3], [0.1, 0.2, 0.3])
     assert (bin_["color"], cube["color"]) == ([], [0.8, 0.1, 0.123, 1.0])
     assert (cube["pos"], cube["quat"]) == ([0.5, 0.6, 0.7], [0.0, 1.0, 0.0, 0.0])
+    planned = [attrs.evolve(things[2], color=()), SceneObject("crate", "box", (1.0, 1.0, 1.0), here)]
+    session.bus.serve(stand_in("/world/shapes"), lambda request: planned)
+    colours = {each["name"]: each["color"] for each in objects.json()}
+    assert colours == {"cube": cube["color"], "crate": [], "bin": []}, "planners know shapes alone"
     objects.close()

@@ -32,7 +32,7 @@ export class Form {
       const { values } = this;
       let whole = true;
       field.suggested = field.suggest.replace(/\{(\w+)\}/g, (_, name) => {
-        const part = [values[name]].flat()[0]?.split("/").at(-1);
+        const part = [values[name]].flat()[0]?.split("/").at(-1).replace(/\.ya?ml$/, "");
         whole &&= Boolean(part);
         return part;
       });
