@@ -238,9 +238,10 @@ def main() -> None:
     begin_s, before, problems = time.monotonic(), hand.total(), list[str]()
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
-        # Its policies need no pretrained weights; looking at an episode takes longer than 20 s.
+        # Its policies need no pretrained weights. Looking at an episode takes longer than 20 s.
         own = (ROOT / "configs/so101_pick_cube.yaml").read_text(encoding="utf-8")
-        (folder / "my_arm.yaml").write_text(re.sub("max_duration_s: [0-9]+", "max_duration_s: 900", own), "utf-8")
+        own = own if chosen.no_pictures else own.replace("max_duration_s: 20", "max_duration_s: 120")
+        (folder / "my_arm.yaml").write_text(own, encoding="utf-8")
         with ui_process(folder) as address, look.browser() as chromium:
             page = look.opened(chromium, address)
             page.context.set_default_timeout(_WAIT_MS)
