@@ -1,0 +1,31 @@
+"""The Chinese words of the page's forms: every label and help that the installed commands declare has some."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from ibrobot_web.server.app import STATIC
+from ibrobot_web.ui.context import Ui
+from ibrobot_web.ui.folders import Folders
+from ibrobot_web.ui.forms import form_of, job_commands
+from ibrobot_web.ui.job_runner import Jobs
+
+pytestmark = pytest.mark.integration
+ENTRY = re.compile(r'^  ("(?:[^"\\]|\\.)*"): ', re.MULTILINE)
+
+
+def test_every_text_of_a_form_is_in_the_table(tmp_path: Path) -> None:
+    ui = Ui(Folders([tmp_path]), Jobs(tmp_path))
+    known = {json.loads(each) for each in ENTRY.findall((STATIC / "words/zh.js").read_text(encoding="utf-8"))}
+    assert len(job_commands()) > 5
+    for command in job_commands():
+        form = form_of(ui, command)
+        texts = [form["summary"]]
+        for field in form["fields"]:
+            help_ = field["help"][:1].upper() + field["help"][1:]
+            texts += [field["label"], *([help_] if help_.casefold() != field["label"].casefold() else [])]
+        missing = [text for text in texts if text and not {text, f"{text} (required)"} & known]
+        assert missing == [], command
