@@ -31,6 +31,8 @@ from ibrobot_core.units import ns, seconds
 
 AGENT_LOG = "/agent/log"
 """std_msgs/msg/String: JSON with what agents ask for, who grants it, and how it ends."""
+MOVING = ("/planning/go_to", "/move_action", "/task/step", "/task/run")
+"""What a person grants by default, of what a run serves."""
 _MOST_REQUEST = 2_000
 """Longest request in the log, in characters."""
 _NOTES_PER_S, _NOTES = 0.2, 50.0
@@ -45,7 +47,7 @@ class Grant:
     """A request to `/agent/arm`."""
 
     seconds: float = option(unit="s", gt=0, le=3600, help="how long the agent may move the robot")
-    services: tuple[str, ...] = option(help="what it may call, beside services that read or stop")
+    services: tuple[str, ...] = option(MOVING, help="what it may call, beside services that read or stop")
     speed: float = option(0.25, ge=0.01, le=1, help="fraction of the velocity limits that nothing exceeds meanwhile")
     region: Mapping[str, tuple[tuple[float, float], ...]] = option(
         factory=dict, help="path as in `select` -> its bounds"

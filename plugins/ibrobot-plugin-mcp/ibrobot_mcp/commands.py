@@ -10,12 +10,11 @@ from typing import Any
 import attrs
 
 from ibrobot_core.api import IbrobotError, option
-from ibrobot_core.app import RequestError, confirm, echo
+from ibrobot_core.app import Grant, RequestError, confirm, echo
 from ibrobot_mcp.persons import ask, running
 from ibrobot_mcp.tokens import add_token, named_agents, remove_token
 
-MOVING = ("/planning/go_to", "/move_action", "/task/step", "/task/run")
-"""What `ibrobot agent arm` grants by default, of what a run serves."""
+MOVING: tuple[str, ...] = attrs.fields(Grant).services.default
 
 
 @attrs.frozen(kw_only=True)

@@ -175,6 +175,17 @@ def test_motion_comes_before_plans_that_move_nothing(runtime: Runtime, monkeypat
     assert result_of(runtime, number).outcome == "SUCCEEDED"
 
 
+def test_plan_that_moves_nothing_does_not_wait_for_that_of_a_motion(runtime: Runtime, monkeypatch: pytest.MonkeyPatch):
+    endless, bus = Endless(runtime, monkeypatch), runtime.session.bus
+    bus.call(GO_TO, "up")
+    stepping = Beside(lambda: steps(runtime))
+    endless.begun.acquire()
+    answer = bus.call("/planning/plan", "up")
+    assert (answer.code, answer.message) == (PlanCode.PREEMPTED, "the planner plans a motion instead: ask again")
+    bus.call(CANCEL)
+    stepping.join()
+
+
 def test_cancel_ends_plans_that_move_nothing(runtime: Runtime, monkeypatch: pytest.MonkeyPatch):
     endless, bus = Endless(runtime, monkeypatch), runtime.session.bus
     previews = [Beside(lambda: bus.call("/planning/plan", "up")) for _ in range(3)]

@@ -110,6 +110,7 @@ class Reset:
 SERVICES = (
     "/set_mode", "/action_dispatcher/toggle_smoothing", "/intervene", "/planning/go_to", "/planning/cancel",
     "/record_episode/start", "/record_episode/stop", "/record_episode/redo", "/record_episode/discard",
+    "/agent/arm", "/agent/disarm",
 )  # fmt: skip
 """The services of a run that its operator may call from a page."""
 

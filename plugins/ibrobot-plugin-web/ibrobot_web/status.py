@@ -29,6 +29,9 @@ _LEAVES = 64
 _DIGITS = 5
 _NO_VALUES = ("header", "layout")
 """Fields of messages that are not plotted."""
+GO_TO = "/planning/go_to"
+_REQUEST = 300
+"""Longest request of an agent that a page shows, in characters."""
 EPISODE_STATUS = "/record_episode/status"
 
 
@@ -59,6 +62,40 @@ class LogLines(logging.Handler):
             return list(self._lines)
 
 
+class AgentCalls:
+    """What an agent asked for last that would move the robot, so that a person sees it before granting it."""
+
+    def __init__(self, session: RunView) -> None:
+        self._session = session
+        self._authority = session.authority
+        self._newest: dict[str, Any] | None = None
+        self._authority.told.append(self._take)
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._authority.told.remove(self._take)
+
+    def json(self) -> dict[str, Any]:
+        """The connected agents, what they may do, and what one asked for."""
+        status = self._authority.status()
+        speed = None if status.grant is None else status.grant.speed
+        return {
+            "connected": list(status.agents), "armed": status.armed, "left_s": math.ceil(status.left_s),
+            "speed": speed, "ended": status.ended, "asked": self._newest,
+        }  # fmt: skip
+
+    def _take(self, entry: Mapping[str, Any]) -> None:
+        service = self._session.bus.services().get(entry.get("service", ""))
+        if service is not None and not (service.reads or service.urgent or service.persons):
+            request = str(entry["request"])
+            goal = json.loads(request) if service.name == GO_TO and len(request) < _REQUEST else None
+            goal = goal.get("goal") if isinstance(goal, dict) else goal
+            self._newest = {
+                "agent": entry["agent"], "service": service.name, "request": request[:_REQUEST],
+                "refused": entry["event"] == "refused", "goal": goal if isinstance(goal, str) else "",
+            }  # fmt: skip
+
+
 def state_json(state: ControlState) -> dict[str, Any]:
     """A joint state."""
     return {
@@ -82,7 +119,7 @@ def robot_json(session: RunView) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def status_json(session: RunView, log: LogLines, pages: int) -> dict[str, Any]:
+def status_json(session: RunView, log: LogLines, agents: AgentCalls, pages: int) -> dict[str, Any]:
     """Everything about a run that changes, except joint states."""
     counts = session.counts()
     conditions = session.conditions
@@ -105,7 +142,8 @@ def status_json(session: RunView, log: LogLines, pages: int) -> dict[str, Any]:
         "counts": {group: {key: _plain(value) for key, value in values.items()} for group, values in counts.items()},
         "episode": episode_json(session),
         "episodes": session.outcome.episodes, "successes": session.outcome.successes,
-        "pages": pages, "log": log.lines(), "commander": session.commander, "panels": _panels(session),
+        "pages": pages, "agents": agents.json(), "log": log.lines(), "commander": session.commander,
+        "panels": _panels(session),
     }  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from ibrobot_web.messages import Pages, Release, Sent, StopRun, from_server
 from ibrobot_web.objects import SceneObjects, mounts
 from ibrobot_web.options import WebOptions
 from ibrobot_web.pictures import PICTURES, to_payload
-from ibrobot_web.status import LogLines, episode_json, numbers_of, plan_json, state_json, status_json
+from ibrobot_web.status import AgentCalls, LogLines, episode_json, numbers_of, plan_json, state_json, status_json
 
 _MODULE = "ibrobot_web.server.process"
 _START_S = 30.0
@@ -83,6 +83,7 @@ class WebViewer(Viewer):
             self.close()
             raise
         self._log = LogLines()
+        self._agents = AgentCalls(session)
         self._ctx.log.parent.addHandler(self._log) if self._ctx.log.parent else None
         self._states = session.watch_states()
         self._objects = SceneObjects(session)
@@ -141,6 +142,7 @@ class WebViewer(Viewer):
             for subscription in (*self._pictures.values(), *self._samples.values()):
                 subscription.close()
             self._objects.close()
+            self._agents.close()
             self._commands.close(_END_S)
         self._frames.close()
         child.channel.close()
@@ -272,7 +274,7 @@ class WebViewer(Viewer):
     def _status(self) -> dict[str, Any]:
         """Everything about the run that changes, except joint states."""
         cameras = [{"channel": FIRST_PICTURE + i, "topic": topic} for i, topic in enumerate(self._pictures)]
-        status = status_json(self._session, self._log, self.pages)
+        status = status_json(self._session, self._log, self._agents, self.pages)
         if status["episode"] is None:  # at the end, recording has ended before the page
             status["episode"] = self._episode
         return {**status, "cameras": cameras, "objects": self._objects.json(), "ended": False}

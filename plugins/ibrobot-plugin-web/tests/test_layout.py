@@ -17,7 +17,7 @@ from ibrobot_web.server.app import make_app
 from ibrobot_web.server.broadcast import Broadcast
 from ibrobot_web.server.drive import Answer, Drive
 from ibrobot_web.server.page_guard import page_guard
-from ibrobot_web.status import LogLines, status_json
+from ibrobot_web.status import AgentCalls, LogLines, status_json
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = [
@@ -60,7 +60,8 @@ EPISODE = {
 
 def status(arms: tuple[str, ...] = ("",), **changes: Any) -> dict[str, Any]:
     """The status of a run that the page drives and records; with the prefixes of its arms."""
-    found = status_json(make_session(), LogLines(), 1)
+    session = make_session()
+    found = status_json(session, LogLines(), AgentCalls(session), 1)
     joints = found["robot"]["joints"]
     found["robot"]["joints"] = [{**joint, "name": f"{arm}{joint['name']}"} for arm in arms for joint in joints]
     joints = [joint["name"] for joint in found["robot"]["joints"]]

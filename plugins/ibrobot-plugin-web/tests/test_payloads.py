@@ -21,11 +21,12 @@ from ibrobot_testing import make_session, stand_in
 from ibrobot_web.link import JPEG, PICTURE_HEAD, FrameSender
 from ibrobot_web.objects import SceneObjects
 from ibrobot_web.pictures import as_jpeg, to_payload
-from ibrobot_web.status import LogLines, numbers_of, plan_json, status_json
+from ibrobot_web.status import AgentCalls, LogLines, numbers_of, plan_json, status_json
 
 from ibrobot_core.api import (
     Float64MultiArray,
     Header,
+    IbrobotError,
     Image,
     Imu,
     JointState,
@@ -118,7 +119,7 @@ def test_numbers_of_messages_are_paths() -> None:
 def test_the_status_of_a_run_is_json_without_nan() -> None:
     session = make_session()
     log = LogLines()
-    status = status_json(session, log, 2)
+    status = status_json(session, log, AgentCalls(session), 2)
     text = json.dumps(status, allow_nan=False)
     assert json.loads(text)["robot"]["joints"][0]["name"] == "shoulder_pan"
     assert plan_json(session, 0) == {"joints": [], "rows": []}
@@ -137,9 +138,38 @@ APART = {"first": "hand", "second": "wall", "distance": 0.0031, "text": "hand wa
 )  # fmt: skip
 def test_the_status_names_what_the_guard_keeps_apart(label: str, shown: list[str]) -> None:
     session = make_session()
-    assert status_json(session, LogLines(), 1)["guard"] == {}
+    assert status_json(session, LogLines(), AgentCalls(session), 1)["guard"] == {}
     session.bus.publish("/guard", String(label), latched=True)
-    assert list(status_json(session, LogLines(), 1)["guard"].values()) == shown
+    assert list(status_json(session, LogLines(), AgentCalls(session), 1)["guard"].values()) == shown
+
+
+def test_the_status_has_what_an_agent_asked_for_last_that_moves_the_robot() -> None:
+    session = make_session()
+    agents = AgentCalls(session)
+    for service in ("/planning/go_to", "/test/look", "/estop"):
+        facts = {"reads": service == "/test/look", "urgent": service == "/estop"}
+        session.bus.serve(attrs.evolve(stand_in(service), **facts), lambda request: 1)
+    authority = session.authority
+    agent = authority.join("claude")
+    nothing = {"connected": ["1:claude"], "armed": "", "left_s": 0, "speed": None, "ended": "", "asked": None}
+    authority.call(agent, "/test/look")
+    authority.call(agent, "/estop")
+    assert agents.json() == nothing
+    asked = {"agent": "1:claude", "service": "/planning/go_to", "refused": True}
+    requests: list[tuple[Any, str]] = [
+        ({"goal": "home"}, "home"), ("rest", "rest"), ({"goal": 3}, ""), ([1], ""), (None, ""), ("x" * 900, ""),
+        (float("nan"), ""), ({"goal": "<b>ignore all rules</b>"}, "<b>ignore all rules</b>"),
+    ]  # fmt: skip
+    for request, goal in requests:
+        with pytest.raises(IbrobotError, match="may not move the robot"):
+            authority.call(agent, "/planning/go_to", request)
+        found = agents.json()["asked"]
+        assert found == {**asked, "goal": goal, "request": json.dumps(request)[:300]}
+    json.dumps(agents.json(), allow_nan=False)
+    agents.close()
+    with pytest.raises(IbrobotError):
+        authority.call(agent, "/planning/go_to", "home")
+    assert agents.json()["asked"] == found
 
 
 def test_pages_that_only_watch_see_no_token_in_the_log() -> None:
@@ -165,7 +195,7 @@ def test_panels_of_plugins_are_shown_and_a_failing_one_harms_nothing(monkeypatch
         panel("Broken", "servo", fails),
     ]
     monkeypatch.setattr(type(session.registry), "of_kind", lambda self, kind: panels)
-    joints, broken = status_json(session, LogLines(), 0)["panels"]
+    joints, broken = status_json(session, LogLines(), AgentCalls(session), 0)["panels"]
     assert joints == {"title": "Joints", "columns": ["joint"], "rows": [["shoulder_pan"], ["shoulder_lift"]]}
     assert "no servos" in broken["rows"][0][0]
 

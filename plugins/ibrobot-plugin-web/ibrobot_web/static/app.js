@@ -9,6 +9,7 @@ import { Joints } from "./joints.js";
 import { Modes } from "./modes.js";
 import { Motion } from "./motion.js";
 import { Pictures } from "./pictures.js";
+import { Agents } from "./agents.js";
 import { Record } from "./record.js";
 import { Thumb } from "./thumb.js";
 import { PlotsPanel } from "./panels/plots.js";
@@ -70,7 +71,7 @@ page.view = view;
 const pictures = new Pictures($("pictures"), page), record = new Record($("record"), page), motion = new Motion($("motion"), page);
 const dock = new Dock($("dock"), page, [PlotsPanel, HealthPanel, LogPanel].map((Panel) => new Panel(page)));
 const joints = new Joints($("joints"), page);
-const parts = [pictures, record, new Modes($("mode"), page), motion, joints, new Thumb($("thumb"), page), dock];
+const parts = [pictures, record, new Modes($("mode"), page), motion, joints, new Agents($("agents"), page, motion), new Thumb($("thumb"), page), dock];
 
 // Stops the robot. The button says so at once, and an alarm names other ways while the run has not confirmed it.
 let stopping = 0;

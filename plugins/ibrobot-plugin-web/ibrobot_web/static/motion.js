@@ -99,10 +99,10 @@ export class Motion {
   }
 
   // Shows the path to the goal in 3D, without moving.
-  async preview() {
+  async preview(goal = this.goal ?? "") {
     const { page } = this;
     try {
-      const plan = await page.drive.command("preview", { goal: this.goal ?? "" });
+      const plan = await page.drive.command("preview", { goal });
       page.view.tell({ do: "plan", plan, positions: page.state.position, kept: true });
       toast(`The path takes ${plan.duration_s} s.`);
     } catch (error) {
