@@ -200,7 +200,7 @@ def marked(mark: str) -> list[str]:
 @nox.session
 def integration(session: nox.Session) -> None:
     """What needs every plugin, or starts processes."""
-    install(session, *PLUGINS, groups=("test", "browser", "examples"))
+    install(session, *PLUGINS, groups=("test", "browser", "agents", "examples"))
     system_libraries(session)
     chromium(session)
     session.run(*PYTEST, *TWO, "-m", f"integration{SHORT}", *marked("integration"), *session.posargs)
@@ -345,7 +345,7 @@ def docs(session: nox.Session) -> None:
 @nox.session
 def types(session: nox.Session) -> None:
     """Types of core and of every plugin, strictly, and of all tests, benchmarks and scripts of the documentation."""
-    install(session, *PLUGINS, groups=("docs", "lint", "test", "browser"))
+    install(session, *PLUGINS, groups=("docs", "lint", "test", "browser", "agents"))
     folder = Path(session.create_tmp()).absolute()
     shared = (
         "tests/shared",

@@ -260,9 +260,9 @@ UPRIGHT = [3.14159, 0.0, 0.0]
 
 
 class Worker:
-    """A scripted agent, by the client of the SDK."""
+    """A scripted agent, by the client of the SDK or another one."""
 
-    def __init__(self, client: Client) -> None:
+    def __init__(self, client: Any) -> None:
         self.client = client
 
     async def call(self, name: str, /, **arguments: Any) -> Any:
@@ -291,17 +291,23 @@ class Worker:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("mode", ["auto", "legacy"])
-def test_scripted_agent_does_ten_tasks_of_increasing_length(tmp_path: Path, mode: str) -> None:
+@pytest.mark.parametrize("kind", ["auto", "legacy", "fastmcp"])
+def test_scripted_agent_does_ten_tasks_of_increasing_length(tmp_path: Path, kind: str) -> None:
     """Each task goes on from the one before; the scene's ground truth counts."""
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "XDG_STATE_HOME": str(tmp_path)}
     arguments = ["-m", "ibrobot_core.cli.command", "mcp", "so101_pick_cube", "--sim"]
     command = [sys.executable, "-c", "from ibrobot_core.cli.command import main; main()", *arguments[2:]]
-    parameters = StdioServerParameters(command=command[0], args=command[1:], env=environment)
+    client: Any
+    if kind == "fastmcp":
+        fastmcp = pytest.importorskip("fastmcp", reason="needs fastmcp: pip install fastmcp")
+        stdio = fastmcp.client.transports.StdioTransport(command[0], command[1:], environment, keep_alive=False)
+        client = fastmcp.Client(stdio)
+    else:
+        client = Client(StdioServerParameters(command=command[0], args=command[1:], env=environment), mode=kind)
     succeeded: list[bool] = []
 
     async def work() -> None:
-        async with Client(parameters, mode=mode) as client:
+        async with client:
             agent = Worker(client)
             assert (await agent.call("state"))["mode"] == "planned"
             grant = [*command[:3], "agent", "arm", "--yes", "--speed", "0.6", "--seconds", "600"]
