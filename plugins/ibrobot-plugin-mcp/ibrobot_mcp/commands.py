@@ -14,7 +14,7 @@ from ibrobot_core.app import Grant, RequestError, confirm, echo
 from ibrobot_mcp.persons import ask, running
 from ibrobot_mcp.tokens import add_token, named_agents, remove_token
 
-MOVING: tuple[str, ...] = attrs.fields(Grant).services.default
+MOVING = attrs.fields(Grant).services.default or ()
 
 
 @attrs.frozen(kw_only=True)

@@ -15,7 +15,7 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import NS_PER_S, JointState, Message, String, Vector
-from ibrobot_core.app import ControlState, RunView, error_text
+from ibrobot_core.app import Authority, ControlState, RunView, error_text
 from ibrobot_web.messages import SERVICES
 from ibrobot_web.modes import modes_json, page_devices
 from ibrobot_web.teleop import JOG
@@ -66,8 +66,8 @@ class AgentCalls:
     """What an agent asked for last that would move the robot, so that a person sees it before granting it."""
 
     def __init__(self, session: RunView) -> None:
-        self._session = session
-        self._authority = session.authority
+        assert isinstance(session.authority, Authority)
+        self._session, self._authority = session, session.authority
         self._newest: dict[str, Any] | None = None
         self._authority.told.append(self._take)
 

@@ -147,8 +147,8 @@ def test_the_status_has_what_an_agent_asked_for_last_that_moves_the_robot() -> N
     session = make_session()
     agents = AgentCalls(session)
     for service in ("/planning/go_to", "/test/look", "/estop"):
-        facts = {"reads": service == "/test/look", "urgent": service == "/estop"}
-        session.bus.serve(attrs.evolve(stand_in(service), **facts), lambda request: 1)
+        declared = attrs.evolve(stand_in(service), reads=service == "/test/look", urgent=service == "/estop")
+        session.bus.serve(declared, lambda request: 1)
     authority = session.authority
     agent = authority.join("claude")
     nothing = {"connected": ["1:claude"], "armed": "", "left_s": 0, "speed": None, "ended": "", "asked": None}
