@@ -4,7 +4,9 @@
 
 Records short demonstrations of a made-up arm as bags (`tests/shared/made_runs.py`): `--each` with every fault of
 `planted_faults.py`, of seeds on which no threshold was chosen, among good ones. Prints a table with the recall and the
-precision of each kind (a finding of a kind in an episode of another kind counts against it), and one JSON object.
+precision of each kind (a finding of a kind in an episode of another kind counts against it), and one JSON object. With
+lerobot-doctor and lerobot-lint in the environment (`uv pip install lerobot-doctor`, `uv pip install --no-deps
+lerobot-lint`) it also counts what these flag, in the same episodes.
 """
 
 from __future__ import annotations
@@ -66,6 +68,21 @@ def make(folder: Path, episodes: int, each: int) -> dict[str, str]:
     return truth
 
 
+def flagged(folder: Path) -> dict[str, set[str]]:
+    """Tool of others -> the names of the episodes that it flags; empty for tools that are not installed."""
+    from ibrobot_diagnose.cause import Reference
+    from ibrobot_diagnose.causes import others
+    from ibrobot_diagnose.diagnosis import diagnose
+    from ibrobot_diagnose.references import find_episodes, read_episode
+
+    tools = [each() for each in others.TOOLS if each in others.CAUSES]
+    names: dict[str, set[str]] = {each.name: set() for each in tools}
+    for episode in find_episodes([folder]) if tools else ():
+        for finding in diagnose(read_episode(episode), Reference(), tools).findings:
+            names[finding.name].add(episode.name)
+    return names
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", type=int, default=200, help="in all")
@@ -82,7 +99,12 @@ def main() -> int:
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
     seconds = perf_counter() - begin
     checked = json.loads(done.stdout)
-    named = {Path(each["episode"]).name: [one["name"] for one in each["causes"]] for each in checked["listed"]}
+    tools = flagged(folder)
+    named = {
+        Path(each["episode"]).name: [one["name"] for one in each["causes"] if one["name"] not in tools]
+        for each in checked["listed"]
+    }
+    named = {name: causes for name, causes in named.items() if causes}
     right, planted, wrong = Counter[str](), Counter(kind for kind in truth.values() if kind), Counter[str]()
     for name, kind in truth.items():
         for one in named.get(name, ()):
@@ -93,16 +115,23 @@ def main() -> int:
     good = [name for name, kind in truth.items() if not kind]
     print(json.dumps({name: [truth[name], each] for name, each in named.items()}), file=sys.stderr)
     accused = sum(name in named for name in good)
-    print(f"{'kind':20}{'recall':>10}{'precision':>12}")
+    of_kind = {kind: {name for name, each in truth.items() if each == kind} for kind in ("", *planted)}
+    print(f"{'kind':20}{'recall':>10}{'precision':>12}{''.join(f'{tool:>16}' for tool in tools)}")
     for kind in (*planted, *(each for each in wrong if each not in planted)):
         of = right[kind] + wrong[kind]
-        print(f"{kind:20}{f'{right[kind]}/{planted[kind]}':>10}{f'{right[kind]}/{of}' if of else '-':>12}")
+        theirs = "".join(f"{f'{len(of_kind.get(kind, set()) & each)}/{planted[kind]}':>16}" for each in tools.values())
+        print(f"{kind:20}{f'{right[kind]}/{planted[kind]}':>10}{f'{right[kind]}/{of}' if of else '-':>12}{theirs}")
+    theirs = "".join(f"{f'{len(of_kind[""] & each)}/{len(good)}':>16}" for each in tools.values())
+    print(f"{'good, listed':20}{f'{accused}/{len(good)}':>10}{'':>12}{theirs}")
     recall = sum(right.values()) / sum(planted.values())
     precision = sum(right.values()) / max(1, sum(right.values()) + sum(wrong.values()))
-    result = {
+    result: dict[str, float] = {
         "recall": recall, "precision": precision, "good": len(good), "good_listed": accused,
         "seconds_per_1000": 1000 * seconds / len(truth),
     }  # fmt: skip
+    for tool, each in tools.items():
+        result[f"{tool}_recall"] = len(each - of_kind[""]) / sum(planted.values())
+        result[f"{tool}_good_listed"] = len(of_kind[""] & each)
     print(json.dumps(result))
     report(**result)
     return 0

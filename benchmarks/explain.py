@@ -2,14 +2,16 @@
 
     python benchmarks/explain.py [--work explain] [--healthy 100] [--trials 1] [--tune] [--only CAUSE ...]
 
-1. Demonstrations of the pick in lockstep, with two small cameras, and policies trained on them: a small ACT on the
-   joints and the cube's pose, one on the pictures, and a small Diffusion policy; each has its card beside it.
+1. Demonstrations of the pick in lockstep, with two small cameras, and policies trained on them: an ACT on the joints
+   and the cube's pose, three that were stopped early, one on the pictures, and a small Diffusion policy; each has its
+   card beside it.
 2. Each fault of `explain_faults.py` in three strengths, `--trials` seeds each: a run of at most 6 s, recorded, and
    explained with the card of the policy's training. The first line must name the fault.
 3. Healthy runs of all policies, successes and failures: nothing may be named.
 
 Demonstrations, trials, and the trials of `--tune`, on which thresholds may be chosen, have seeds of their own. A stage
-whose result is in the folder `--work` is not done again, nor is a run. Needs LeRobot in the same environment. Prints a
+whose result is in the folder `--work` is not done again. A run is recorded there once, and explained anew each time.
+Needs LeRobot in the same environment. Prints a
 table and one JSON object with the shares of right first lines, and the false accusations.
 """
 
@@ -22,14 +24,15 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import closing, redirect_stderr, redirect_stdout
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from explain_faults import FAULTS, Fault
+import attrs
+from explain_faults import EARLY, FAULTS, Fault
 from figures import report
 
 CONFIG = Path(__file__).parents[1] / "configs" / "so101_pick_cube.yaml"
@@ -38,7 +41,9 @@ DEMOS, TUNED, REPORTED = 1000, 3000, 5000
 STRENGTHS = ("mild", "medium", "strong")
 SECONDS = 6
 PROMPT = "put the cube into the bin"
-POLICIES = ("state", "pictures", "diffusion", "scripted")
+POLICIES = ("state", *(f"early-{steps}" for steps in EARLY), "pictures", "diffusion", "scripted")
+HEALTHY = ("state", f"early-{EARLY[0]}", "pictures", "diffusion", "scripted")
+"""Policies of the runs without a fault: some succeed, some fail."""
 _CAMERAS = "".join(
     f"\n  - {{name: {name}, kind: camera, type: opencv, device: {name}, width: 96, height: 72, fps: 15}}"
     for name in ("top", "wrist")
@@ -82,16 +87,19 @@ def prepare(work: Path, episodes: int, policies: Sequence[str]) -> None:
         )  # fmt: skip
     listed = sorted(demos.glob("pick/episodes/episode_*"))
     small = ("--policy.down_dims=[64,128]", "--policy.horizon=32", "--policy.n_action_steps=24",
-             "--policy.num_inference_steps=5")  # fmt: skip
+             "--policy.num_inference_steps=5", "--policy.pretrained_backbone_weights=null",
+             "--policy.scheduler_warmup_steps=50", "--policy.optimizer_lr=5e-4")  # fmt: skip
+    least = ("--policy.dim_model=256", "--policy.dim_feedforward=512", "--policy.pretrained_backbone_weights=null")
     state, pictures = work / "dataset-state", work / "dataset-pictures"
     if not state.exists():
         command("convert", *listed, "--out", state, "--config", CONFIG, "--force-contract")
     if not pictures.exists():
         command("convert", *listed[: len(listed) // 2], "--out", pictures, "--codec", "h264")
     for name, dataset, words in (
-        ("state", state, ("--steps", "240")),
-        ("diffusion", state, ("--policy", "diffusion", "--steps", "200", *small)),
-        ("pictures", pictures, ("--steps", "160", "--batch-size", "8", "--policy.pretrained_backbone_weights=null")),
+        ("state", state, ("--steps", "900", *least, "--policy.optimizer_lr=1e-4")),
+        *((f"early-{steps}", state, ("--steps", str(steps), *least)) for steps in EARLY),
+        ("diffusion", state, ("--policy", "diffusion", "--steps", "900", *small)),
+        ("pictures", pictures, ("--steps", "300", "--batch-size", "8", *least)),
     ):
         if name in policies and not (work / name / "checkpoints/last").exists():
             command("train", dataset, "--out", work / name, "--device", "cpu", *words)
@@ -99,19 +107,40 @@ def prepare(work: Path, episodes: int, policies: Sequence[str]) -> None:
         command("datasets", "card", demos, "--out", work / "reference.json")
 
 
-def explained(work: Path, policy: str, fault: Fault | None, strength: Any, seed: int) -> dict[str, Any]:
-    """A run with a fault, and what is said of it; changes this process."""
-    from ibrobot_diagnose.cause import Reference
-    from ibrobot_diagnose.diagnosis import diagnose
-    from ibrobot_diagnose.references import card_of, read_episode
-    from ibrobot_diagnose.report import Explanation
+@attrs.frozen
+class Trial:
+    """A run with a fault, or without one."""
 
+    cause: str
+    """Empty for a healthy run."""
+    strength: str
+    policy: str
+    argument: Any
+    seed: int
+
+    @property
+    def fault(self) -> Fault | None:
+        """None for a healthy run."""
+        return FAULTS.get(self.cause)
+
+    def folder(self, work: Path) -> Path:
+        """Where its recording is kept."""
+        return (
+            work
+            / "runs"
+            / "-".join(filter(None, (self.cause or "healthy", self.strength, self.policy, str(self.seed))))
+        )
+
+
+def act(work: Path, trial: Trial) -> None:
+    """Record a run; changes this process."""
     from ibrobot_core.cli.main import main
 
-    root = work / "runs" / f"{policy}-{seed}"
+    fault, policy = trial.fault, trial.policy
+    root = trial.folder(work).with_suffix(".part")
     shutil.rmtree(root, ignore_errors=True)
     root.mkdir(parents=True)
-    words = list(fault.options(strength)) if fault is not None else []
+    words = list(fault.options(trial.argument)) if fault is not None else []
     config = root / "cube.yaml"
     velocity = words[1] if words[:1] == ["velocity"] else "3.0"
     config.write_text(robot(velocity, sees=policy in ("pictures", "scripted")), encoding="utf-8")
@@ -119,64 +148,68 @@ def explained(work: Path, policy: str, fault: Fault | None, strength: Any, seed:
     if policy == "scripted":
         words += ["--mode", "scripted"]
     else:
-        words += [
-            "--mode",
-            "learned",
-            "--set",
-            f"models.act.path={work / policy / 'checkpoints/last/pretrained_model'}",
-        ]
-        words += ["--set", "models.act.threads=1"]
+        checkpoint = work / policy / "checkpoints/last/pretrained_model"
+        words += ["--mode", "learned", "--set", f"models.act.path={checkpoint}", "--set", "models.act.threads=1"]
     words += ["--set", f"contract.max_duration_s={SECONDS}", "--set", f"recording.root={root / 'episodes'}"]
     always = ("--sim", "--headless", "--lockstep", "--episodes", "1", "--set", "recording.type=mcap")
-    line = ["ibrobot", "launch", str(config), *always, "--seed", str(seed), *words]
+    line = ["ibrobot", "launch", str(config), *always, "--seed", str(trial.seed), *words]
     if fault is not None:
-        fault.plant(strength)
+        fault.plant(trial.argument)
     with (root / "log").open("w") as log, patch.object(sys, "argv", line), redirect_stdout(log), redirect_stderr(log):
         try:
             main()
         except SystemExit as end:
             print(end)
-    (episode,) = root.glob("episodes/*/episodes/episode_*")
+    episodes = list(root.glob("episodes/*/episodes/episode_*"))
+    if len(episodes) != 1:
+        raise RuntimeError(f"{root / 'log'}: recorded {len(episodes)} episodes")
+    root.rename(trial.folder(work))
+
+
+def explained(work: Path, trial: Trial) -> dict[str, Any]:
+    """What is said of a recorded run."""
+    from ibrobot_diagnose.cause import Reference
+    from ibrobot_diagnose.diagnosis import diagnose
+    from ibrobot_diagnose.references import card_of, read_episode
+    from ibrobot_diagnose.report import Explanation
+
+    (episode,) = trial.folder(work).glob("episodes/*/episodes/episode_*")
     window = read_episode(episode)
-    card = card_of(work / policy if fault is not None and fault.trained else work / "reference.json")
-    reference = Reference(card)
+    trained = trial.fault is not None and trial.fault.trained
+    reference = Reference(card_of(work / trial.policy if trained else work / "reference.json"))
     explanation = Explanation.of(window, reference, diagnose(window, reference))
     findings = explanation.diagnosis.findings
-    shutil.rmtree(root)
     return {
         "outcome": window.outcome, "first": "" if findings and findings[0].cause.weak else explanation.diagnosis.first,
         "text": explanation.first, "all": [(each.name, round(each.evidence.likelihood, 3)) for each in findings],
     }  # fmt: skip
 
 
-def _into(queue: Any, *arguments: Any) -> None:
-    try:
-        queue.put(explained(*arguments))
-    except Exception as error:  # noqa: BLE001 - one run does not end the others
-        queue.put({"error": f"{type(error).__name__}: {error}"})
-
-
-def in_child(*arguments: Any) -> dict[str, Any]:
-    """As `explained`, in a process of its own."""
-    context = multiprocessing.get_context("fork")
-    with closing(context.SimpleQueue()) as queue:
-        child = context.Process(target=_into, args=(queue, *arguments))
+def tried(work: Path, trial: Trial) -> dict[str, Any]:
+    """The result of a trial; its run is recorded in a process of its own, and only once."""
+    if not trial.folder(work).exists():
+        child = multiprocessing.get_context("fork").Process(target=act, args=(work, trial))
         child.start()
-        result: dict[str, Any] = queue.get()
         child.join()
-    return result
+    try:
+        return explained(work, trial)
+    except Exception as error:  # noqa: BLE001 - one run does not end the others
+        return {"error": f"{type(error).__name__}: {error}"}
 
 
-def runs(arguments: argparse.Namespace) -> Iterator[tuple[str, str, str, Any, int]]:
-    """Cause (empty for a healthy run), strength, policy, argument and seed of each run."""
-    first = TUNED if arguments.tune else REPORTED
-    for number in range(3 * arguments.trials):  # strong ones first
-        place = 2 - number % 3
+def trials(arguments: argparse.Namespace) -> Iterator[Trial]:
+    """Each run; strong faults first, then mild ones."""
+    first = TUNED if arguments.tune else arguments.seeds
+    for number in range(3 * arguments.trials):
+        place = (2, 0, 1)[number % 3]
         for row, (name, fault) in enumerate(FAULTS.items()):
-            if fault.policy in arguments.policies and (not arguments.only or name in arguments.only):
-                yield name, STRENGTHS[place], fault.policy, fault.strengths[place], first + 100 * number + row
+            policy = fault.policy or f"early-{fault.strengths[place]}"
+            if policy in arguments.policies and (not arguments.only or name in arguments.only):
+                yield Trial(name, STRENGTHS[place], policy, fault.strengths[place], first + 100 * number + row)
+        policies = [each for each in HEALTHY if each in arguments.policies]
         for healthy in range(number, arguments.healthy, 3 * arguments.trials):
-            yield "", "", arguments.policies[healthy % len(arguments.policies)], None, first + 10_000 + healthy
+            policy = policies[healthy % len(policies)]
+            yield Trial("", "", policy, None, first + 10_000 + healthy)
 
 
 def main() -> int:
@@ -185,6 +218,7 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=40, help="demonstrations")
     parser.add_argument("--healthy", type=int, default=100, help="runs without a fault")
     parser.add_argument("--trials", type=int, default=1, help="runs of each fault and strength")
+    parser.add_argument("--seeds", type=int, default=REPORTED, help="first seed of the runs that count")
     parser.add_argument("--tune", action="store_true", help="the seeds on which thresholds may be chosen")
     parser.add_argument("--only", nargs="*", help="some causes")
     parser.add_argument("--policies", nargs="*", default=POLICIES, help="some of these")
@@ -193,32 +227,37 @@ def main() -> int:
     prepare(work, arguments.episodes, arguments.policies)
     for module in ("ibrobot_core.cli.main", "ibrobot_diagnose.causes", "ibrobot_lerobot.model"):
         import_module(module)  # each run would import it again
-    done = work / ("tuned.jsonl" if arguments.tune else "reported.jsonl")
-    known = [json.loads(line) for line in done.read_text().splitlines()] if done.exists() else []
-    results = {tuple(each["run"]): each for each in known}
-    for name, strength, policy, argument, seed in runs(arguments):
-        key = (name, strength, policy, seed)
-        if key not in results:
-            result = in_child(work, policy, FAULTS[name] if name else None, argument, seed)
-            results[key] = {"run": key, **result}
-            with done.open("a") as file:
-                file.write(json.dumps(results[key]) + "\n")
-            print(*key, result.get("first", result.get("error")), file=sys.stderr, flush=True)
+    results: dict[Trial, dict[str, Any]] = {}
+    for trial in trials(arguments):
+        results[trial] = result = tried(work, trial)
+        right = result.get("first") == trial.cause
+        why = "" if right else f" {result.get('all', '')} {result.get('text', result.get('error'))}"
+        said = result.get("first", "error")
+        print(
+            trial.cause or "healthy",
+            trial.strength,
+            trial.policy,
+            trial.seed,
+            said or "-",
+            why,
+            file=sys.stderr,
+            flush=True,
+        )
     return show(results)
 
 
-def show(results: dict[tuple[Any, ...], dict[str, Any]]) -> int:
+def show(results: Mapping[Trial, dict[str, Any]]) -> int:
     """Print the table, and the figures."""
     right, all_of = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
-    for (name, strength, _, _), each in results.items():
-        if name:
-            all_of[name, strength] += 1
-            right[name, strength] += each.get("first") == name
+    for trial, each in results.items():
+        if trial.cause:
+            all_of[trial.cause, trial.strength] += 1
+            right[trial.cause, trial.strength] += each.get("first") == trial.cause
     print(f"{'cause':20}{''.join(f'{strength:>10}' for strength in STRENGTHS)}")
     for name in dict.fromkeys(key[0] for key in all_of):
         cells = [f"{right[name, each]}/{all_of[name, each]}" for each in STRENGTHS]
         print(f"{name:20}{''.join(f'{cell:>10}' for cell in cells)}")
-    healthy = [each for key, each in results.items() if not key[0]]
+    healthy = [each for trial, each in results.items() if not trial.cause]
     accused = [each for each in healthy if each.get("first") != ""]
     weak = [each for each in healthy if each.get("outcome") != "success"]
     said = sum(each.get("text", "").startswith("Nothing is wrong with the set-up") for each in weak)

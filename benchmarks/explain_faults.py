@@ -23,6 +23,8 @@ from ibrobot_core.launch.sources.policy import PolicySource
 type Array = NDArray[Any]
 
 PAN, LIFT, ELBOW, GRIPPER = 0, 1, 2, 5
+EARLY = (240, 120, 40)
+"""Steps after which trainings were stopped: 1.4, 0.7 and 0.2 times through the data."""
 REST = np.array([0, -1.57, 1.57, 0.79, 0, 0])
 
 
@@ -35,7 +37,7 @@ class Fault:
     strengths: tuple[Any, Any, Any]
     """Arguments of `plant`: mild, medium, strong."""
     policy: str = "state"
-    """The policy that acts: `state`, `pictures` or `diffusion`, or `scripted`."""
+    """The policy that acts: `state`, `pictures`, `diffusion` or `scripted`; empty for one that was stopped early."""
     trained: bool = False
     """Whether the card of the training is at hand, and not only one of the data."""
     options: Callable[[Any], tuple[str, ...]] = lambda strength: ()
@@ -309,7 +311,7 @@ FAULTS: Mapping[str, Fault] = {
     "gripper_reversed": Fault(gripper_reversed, (1, 1, 1)),
     "gripper_scaled": Fault(gripper_scaled, (1.8, 2.5, 3.5)),
     "joint_zero": Fault(zero, (0.2, 0.3, 0.45), "pictures"),
-    "checkpoint_early": Fault(nothing, (1, 1, 1), trained=True),
+    "checkpoint_early": Fault(nothing, EARLY, "", trained=True),
     "unseen_success": Fault(never_judged, (1, 1, 1), "scripted"),
     "picture_dark": Fault(scaled, ((0.65,), (0.5,), (0.25,)), "pictures"),
     "picture_bright": Fault(scaled, ((1.4,), (1.6,), (1.9,)), "pictures"),

@@ -7,6 +7,8 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -62,53 +64,62 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("asked")
 
 
-@pytest.fixture(scope="module")
-def served(root: Path) -> Iterator[Callable[[Path], str]]:
-    """Serves a checkpoint, and says where."""
-    servers: list[subprocess.Popen[str]] = []
+@contextmanager
+def served(checkpoint: Path) -> Iterator[str]:
+    """A server of a checkpoint; its address."""
     # Zenoh's own threads run from here on, with the files that they keep.
     zenoh, endpoint = installed_plugins().find("transport", "zenoh"), f"tcp/127.0.0.1:{free_port()}"
     router = zenoh.make(zenoh.options(mode="router", listen=(endpoint,)), host_context())
     zenoh.make(zenoh.options(connect=(endpoint,)), host_context()).close()
     router.close()
-
-    def serve(checkpoint: Path) -> str:
-        endpoint = f"tcp/127.0.0.1:{free_port()}"
-        words = ("serve", checkpoint, "--type", "lerobot", "--name", "act", "--set", "threads=1", "--listen", endpoint)
-        server = subprocess.Popen([*ibrobot_command(), *map(str, words)], stdout=subprocess.PIPE, text=True)
-        servers.append(server)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    words = ("serve", checkpoint, "--type", "lerobot", "--name", "act", "--set", "threads=1", "--listen", endpoint)
+    server = subprocess.Popen([*ibrobot_command(), *map(str, words)], stdout=subprocess.PIPE, text=True)
+    try:
         assert server.stdout is not None
         assert server.stdout.readline().startswith("serving act")
-        return endpoint
-
-    yield serve
-    for server in servers:
+        yield endpoint
+    finally:
         server.terminate()
         server.communicate(timeout=60)
 
 
+def record(root: Path, kind: str, mode: str, endpoint: str = "") -> Path:
+    """A run of a kind of policy with an execution mode, recorded."""
+    checkpoint = root / kind if (root / kind).exists() else save(KINDS[kind](), root / kind)
+    network = ("--set", f"transport={{type: zenoh, connect: [{endpoint}]}}") if endpoint else ()
+    done = run_here(
+        "launch", robot(root / "cube.yaml"), "--sim", "--headless", "--lockstep", "--episodes", 1,
+        "--mode", "learned", "--set", "contract.max_duration_s=2", "--set", "models.act.threads=1",
+        "--set", f"models.act.path={checkpoint}", "--set", f"recording.root={root / kind}-{mode}",
+        "--set", "recording.type=mcap",
+        "--set", f"control_modes.learned.inference.execution_mode={mode}", *network,
+    )  # fmt: skip
+    assert done.returncode in (0, NOT_ALL_SUCCEEDED), done.stderr
+    return next(Path(f"{root / kind}-{mode}").glob("*/episodes/episode_*"))
+
+
 @pytest.fixture(scope="module")
-def recorded(root: Path, served: Callable[[Path], str]) -> Callable[[str, str], tuple[Path, str]]:
-    """A run of a kind of policy with an execution mode, recorded, and the server's address."""
-    made: dict[tuple[str, str], tuple[Path, str]] = {}
+def recorded(root: Path) -> Callable[[str], Path]:
+    """A run of a kind of policy in the run's own process, recorded once."""
+    return cache(lambda kind: record(root, kind, "monolithic"))
 
-    def run(kind: str, mode: str) -> tuple[Path, str]:
-        if (kind, mode) not in made:
-            checkpoint = root / kind if (root / kind).exists() else save(KINDS[kind](), root / kind)
-            endpoint = served(checkpoint) if mode == "distributed" else ""
-            network = ("--set", f"transport={{type: zenoh, connect: [{endpoint}]}}") if endpoint else ()
-            done = run_here(
-                "launch", robot(root / "cube.yaml"), "--sim", "--headless", "--lockstep", "--episodes", 1,
-                "--mode", "learned", "--set", "contract.max_duration_s=2", "--set", "models.act.threads=1",
-                "--set", f"models.act.path={checkpoint}", "--set", f"recording.root={root / kind}-{mode}",
-                "--set", "recording.type=mcap",
-                "--set", f"control_modes.learned.inference.execution_mode={mode}", *network,
-            )  # fmt: skip
-            assert done.returncode in (0, NOT_ALL_SUCCEEDED), done.stderr
-            made[kind, mode] = next(Path(f"{root / kind}-{mode}").glob("*/episodes/episode_*")), endpoint
-        return made[kind, mode]
 
-    return run
+@pytest.fixture(scope="module")
+def answered(request: pytest.FixtureRequest, root: Path, recorded: Callable[[str], Path]) -> Iterator[tuple[Path, str]]:
+    """A recorded run, and the address of the server that computed its answers; empty without one.
+
+    A fixture of the module, since the server lives until the test's own leaks have been looked for.
+    """
+    kind, mode = request.param
+    if mode == "monolithic":
+        yield recorded(kind), ""
+    elif mode == "process":
+        yield record(root, kind, mode), ""
+    else:
+        checkpoint = root / kind if (root / kind).exists() else save(KINDS[kind](), root / kind)
+        with served(checkpoint) as endpoint:
+            yield record(root, kind, mode, endpoint), endpoint
 
 
 def facts_of(episode: Path, *words: object) -> dict[str, Any]:
@@ -132,15 +143,17 @@ def asked_again(
 
 
 ASKED = [
-    pytest.param(kind, mode, marks=[] if kind == "act" and mode != "distributed" else [pytest.mark.long])
+    pytest.param(
+        (kind, mode), marks=[] if kind == "act" and mode != "distributed" else [pytest.mark.long], id=f"{kind}-{mode}"
+    )
     for kind in KINDS
     for mode in MODES
 ]
 
 
-@pytest.mark.parametrize(("kind", "mode"), ASKED)
-def test_answers_are_equal_bit_for_bit(kind: str, mode: str, recorded: Callable[..., tuple[Path, str]]) -> None:
-    episode, endpoint = recorded(kind, mode)
+@pytest.mark.parametrize("answered", ASKED, indirect=True)
+def test_answers_are_equal_bit_for_bit(answered: tuple[Path, str]) -> None:
+    episode, endpoint = answered
     for server in {"", endpoint}:
         asked, equal, whose = asked_again(episode, server=server)
         assert asked >= 2
@@ -164,7 +177,7 @@ def other_statistics(path: Path) -> None:
     [(other_weights, "the weights are others"), (other_statistics, "the checkpoint's processors")],
 )
 def test_another_checkpoint_is_named(change: Any, whose: str, root: Path, recorded: Any, tmp_path: Path) -> None:
-    episode, _ = recorded("act", "monolithic")
+    episode = recorded("act")
     changed = shutil.copytree(root / "act", tmp_path / "act")
     change(changed)
     asked, equal, said = asked_again(episode, str(changed))
@@ -178,7 +191,7 @@ def test_policy_that_ignores_its_pictures_is_named(root: Path, recorded: Any) ->
     tensors = load_file(blind / "model.safetensors")
     seen = "model.encoder_img_feat_input_proj.weight"
     save_file({**tensors, seen: torch.zeros_like(tensors[seen])}, blind / "model.safetensors", {"format": "pt"})
-    facts = facts_of(recorded("blind", "monolithic")[0], ".")
+    facts = facts_of(recorded("blind"), ".")
     (ignored,) = (each for each in facts["causes"] if each["name"] == "camera_ignored")
     assert ignored["text"].startswith("The policy ignores its pictures, of all cameras")
     assert ignored["likelihood"] > 0.9
@@ -195,7 +208,7 @@ def test_policy_that_ignores_its_pictures_is_named(root: Path, recorded: Any) ->
 
 
 def test_attention_is_shown_over_the_pictures(recorded: Any, tmp_path: Path) -> None:
-    episode, _ = recorded("act", "monolithic")
+    episode = recorded("act")
     model = model_of(read_episode(episode), episode, "")
     model.load()
     try:
@@ -223,7 +236,7 @@ def with_document(model: Any, **changes: Any) -> Any:
 
 
 def test_another_contract_is_named(recorded: Any) -> None:
-    episode, _ = recorded("act", "monolithic")
+    episode = recorded("act")
 
     def exchanged(model: Any) -> Any:
         contract = json.loads(json.dumps(model.window.document["contract"]))
@@ -254,7 +267,7 @@ def changed_answers(model: Any, **changes: Any) -> Any:
     ],
 )
 def test_other_libraries_and_processors_are_named(server: str, said: str, recorded: Any) -> None:
-    episode, _ = recorded("act", "monolithic")
+    episode = recorded("act")
     here = {
         "torch": version("torch"), "lerobot": version("lerobot"), "cpu": torch.backends.cpu.get_cpu_capability(),
     }  # fmt: skip
@@ -262,7 +275,7 @@ def test_other_libraries_and_processors_are_named(server: str, said: str, record
 
 
 def test_another_picture_is_named(recorded: Any) -> None:
-    episode, _ = recorded("act", "monolithic")
+    episode = recorded("act")
     window = read_episode(episode)
     at_ns = sorted(each.answer.observed_ns for each in window.asked)[1]
 

@@ -13,7 +13,16 @@ from ibrobot_provenance.reports import ReportDescriptor
 from ibrobot_core.api import Descriptor, Late, hookimpl
 from ibrobot_core.app import Command, Kind, SectionDescriptor
 from ibrobot_diagnose.cause import ARM_VIEW, DEVICE_POSE, KIND, CauseDescriptor
-from ibrobot_diagnose.options import CHECK_EVENTS, EVENTS, PREFLIGHT_EVENTS, REPORT, SECTION, PreflightSection
+from ibrobot_diagnose.options import (
+    CHECK,
+    CHECK_EVENTS,
+    CHECK_KIND,
+    EVENTS,
+    PREFLIGHT_EVENTS,
+    REPORT,
+    SECTION,
+    PreflightSection,
+)
 from ibrobot_diagnose.options import KIND as REPORT_KIND
 
 
@@ -53,9 +62,13 @@ def _is_explanation(folder: Path) -> bool:
     return (folder / REPORT).is_file()
 
 
+def _is_check(folder: Path) -> bool:
+    return (folder / CHECK).is_file()
+
+
 @hookimpl
 def ibrobot_reports() -> Iterable[ReportDescriptor]:
-    """Explanations."""
+    """Explanations, and checks of datasets."""
     contents = "ibrobot_diagnose.contents"
     yield ReportDescriptor(
         REPORT_KIND,
@@ -64,4 +77,13 @@ def ibrobot_reports() -> Iterable[ReportDescriptor]:
         reads=_is_explanation,
         lines=Late(f"{contents}:lines_of"),
         make=Late(f"{contents}:read_contents"),
+    )
+    checks = "ibrobot_diagnose.check_contents"
+    yield ReportDescriptor(
+        CHECK_KIND,
+        summary="Episodes of datasets to look at.",
+        label="Checks",
+        reads=_is_check,
+        lines=Late(f"{checks}:lines_of"),
+        make=Late(f"{checks}:read_contents"),
     )

@@ -21,7 +21,7 @@ from ibrobot_diagnose.alignment import shift_of
 from ibrobot_diagnose.course import delay_of
 from ibrobot_diagnose.pictures import SMALL, Grey, background, descriptors, grey, nearest, png, read_png
 from ibrobot_diagnose.rig import Rig, rig_of
-from ibrobot_diagnose.window import Camera, Floats, Window
+from ibrobot_diagnose.window import Camera, Floats, Limits, Window
 
 FILE = "reference.json"
 """Name of the card in the folder of a checkpoint or a dataset."""
@@ -31,6 +31,8 @@ WAY = 16
 """Positions of the way of an episode."""
 _OF_EPISODE, _IN_ALL, _POSES = 24, 480, 200
 """Most thumbnails of an episode and of a camera, and most start and end poses."""
+_RIDES = 2.0
+"""Deviation of a pixel from its median over the episodes [grey values]; where nothing moves, noise is below it."""
 _LARGEST = 64 << 20
 """Largest file that is read [bytes]."""
 
@@ -64,6 +66,11 @@ class CameraCard:
     def vectors(self) -> NDArray[np.float32]:
         """Descriptors of the thumbnails."""
         return descriptors(self.thumbnails)
+
+    @cached_property
+    def rides(self) -> bool:
+        """Whether the camera is on the arm: nearly all of its picture changes."""
+        return float(np.quantile(self.moving, 0.25)) >= _RIDES
 
     def at(self, name: str, level: float) -> float:
         """A quantile of a number."""
@@ -110,6 +117,8 @@ class Card:
     """Mean and deviation of state and action in the unit of the training; None if unknown."""
     rig: Rig | None = None
     """The rig at its last episode, or when it was taken; None if it is unknown."""
+    limits: tuple[Limits, ...] | None = None
+    """The limits of the joints in its episodes, the widest; None if they are unknown."""
 
     def quantile(self, name: str, level: float) -> float:
         """A quantile over the episodes, of `series`."""
@@ -144,6 +153,7 @@ class Card:
             "statistics": self.statistics,
             "cameras": {key: _camera_facts(each) for key, each in self.cameras.items()},
             "rig": None if self.rig is None else self.rig.facts(),
+            "limits": None if self.limits is None else [_limits_facts(each) for each in self.limits],
         }  # fmt: skip
 
     @classmethod
@@ -189,10 +199,24 @@ class Card:
             cameras={str(key): _read_camera(each, len(joints)) for key, each in facts["cameras"].items()},
             norm_mode=facts["norm_mode"], trained=facts["trained"], statistics=facts["statistics"],
             rig=None if facts.get("rig") is None else Rig.of(facts["rig"]),  # cards of before have none
+            limits=None if facts.get("limits") is None else _read_limits(facts["limits"], len(joints)),
         )  # fmt: skip
 
 
 _QUANTILES = ("state", "action", "speed", "lead")
+
+
+def _limits_facts(limits: Limits) -> dict[str, float | None]:
+    return {name: value if math.isfinite(value) else None for name, value in attrs.asdict(limits).items()}
+
+
+def _read_limits(facts: Any, joints: int) -> tuple[Limits, ...]:
+    if len(facts) != joints:
+        raise ValueError("limits has not an entry for each joint")
+    return tuple(
+        Limits(**{name: _finite(each[name], name) for name in attrs.fields_dict(Limits) if each[name] is not None})
+        for each in facts
+    )
 
 
 def _rounded(values: Floats) -> list[list[float]]:
@@ -353,11 +377,15 @@ def series_of(window: Window) -> dict[str, float]:
 
 
 def moving_speed(window: Window) -> float:
-    """Mean speed of the commands, or of the arm without commands, over the joints while it moves [rad/s]."""
+    """Speed of the commands, or of the arm without commands, over the joints, see `speed_of` [rad/s]."""
     values = window.commands if "commands" in window.streams else window.states
-    speed = np.nan_to_num(np.abs(np.diff(values, axis=0)).sum(axis=1)) * window.contract.rate_hz
-    moving = speed > 0.1
-    return float(speed[moving].mean()) if moving.any() else 0.0
+    return speed_of(np.nan_to_num(np.abs(np.diff(values, axis=0)).sum(axis=1)) * window.contract.rate_hz)
+
+
+def speed_of(speeds: Floats) -> float:
+    """The speed at which the way is travelled: the mean over the way, not over time, so that rests do not count."""
+    way = float(speeds.sum())
+    return float((speeds**2).sum()) / way if way > 0 else 0.0
 
 
 def background_of(camera: Camera) -> tuple[Grey, Grey] | None:
@@ -378,6 +406,7 @@ class Maker:
         self._ages: dict[str, list[float]] = {}
         self._cameras: dict[str, _CameraMaker] = {}
         self._rig: Rig | None = None
+        self._limits: tuple[Limits, ...] | None = None
 
     def add(self, window: Window) -> None:
         """Add an episode.
@@ -406,6 +435,7 @@ class Maker:
         self._tables["ways"].append(way_of(window)[None])
         self._prompts[window.prompt] += 1
         self._rig = window.rig or rig_of(window) or self._rig
+        self._widen(window.limits)
         for name, value in series_of(window).items():
             self._series.setdefault(name, []).append(value)
         if not window.sampled and len(window.state.times_ns):
@@ -418,6 +448,19 @@ class Maker:
                     ages = np.array(camera.times_ns) - np.array(camera.stamps_ns)
                     name = f"pictures of {camera.name}"
                     self._ages.setdefault(name, []).append(float(np.median(ages)) / 1e6)
+
+    def _widen(self, limits: tuple[Limits, ...]) -> None:
+        """Keep the widest limits of each joint."""
+        if all(each == Limits() for each in limits):
+            return  # no robot YAML states them
+        before = self._limits or limits
+        self._limits = tuple(
+            Limits(
+                min(a.lower, b.lower), max(a.upper, b.upper), max(a.velocity, b.velocity),
+                max(a.acceleration, b.acceleration),
+            )
+            for a, b in zip(before, limits, strict=True)
+        )  # fmt: skip
 
     def join(self, other: Maker) -> None:
         """Add the episodes of another maker.
@@ -435,6 +478,8 @@ class Maker:
             self._tables[name] += tables
         self._prompts += other._prompts
         self._rig = other._rig or self._rig
+        if other._limits is not None:
+            self._widen(other._limits)
         self._rests += other._rests
         for own, theirs in ((self._series, other._series), (self._ages, other._ages)):
             for name, values in theirs.items():
@@ -466,7 +511,8 @@ class Maker:
             contract.rate_hz, joints, contract.canonical(), len(joined["starts"]),
             len(joined["state"]), dict(self._prompts), **quantiles, **poses, following=tuple(following), series=series,
             ages_ms={name: float(np.median(each)) for name, each in self._ages.items()},
-            cameras={key: each.card() for key, each in self._cameras.items()}, rig=self._rig, **more,
+            cameras={key: each.card() for key, each in self._cameras.items()}, rig=self._rig, limits=self._limits,
+            **more,
         )  # fmt: skip
 
 

@@ -125,6 +125,8 @@ class Cause(ABC):
     """Names of causes that this one brings about: those are consequences if this one is found."""
     weak: ClassVar[bool] = False
     """Whether it speaks of a policy that errs, and not of the set-up: more or better data is what helps."""
+    mends: ClassVar[Literal["drop", "trim start", "trim end", "judge"]] = "drop"
+    """What mends an episode of a dataset with it."""
     remedy: ClassVar[str]
     """What to do, in the imperative."""
 

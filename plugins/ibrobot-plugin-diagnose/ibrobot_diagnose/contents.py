@@ -160,18 +160,19 @@ def _pictures(explanation: Explanation) -> str:
     shown = [each for finding in explanation.diagnosis.findings for each in finding.evidence.pictures]
     if explanation.reference.model is not None:
         shown += explanation.reference.model.looks
-    return _figures(shown)
+    return figures(shown)
 
 
-def _figures(shown: Sequence[Shown]) -> str:
+def figures(shown: Sequence[Shown], title: str = "Pictures") -> str:
+    """Pictures side by side, below a title if there is one."""
     shown = list({each.title: each for each in shown}.values())
     if not shown:
         return ""
-    figures = [
+    made = [
         tag("figure", _image(each.picture, each.title) + tag("figcaption", escape(each.title)), style="margin:0")
         for each in shown
     ]
-    return tag("h2", "Pictures") + tag("div", "".join(figures), class_="panels")
+    return (tag("h2", escape(title)) if title else "") + tag("div", "".join(made), class_="panels")
 
 
 def _players(explanation: Explanation) -> str:
@@ -218,5 +219,5 @@ def write_preflight(out: Path, facts: Mapping[str, Any], findings: Sequence[Find
         sections.append(ReportSection("Notes", tuple(Text(note) for note in facts["notes"])))
     bad = (each.evidence for each in findings if each.evidence.verdict in ("fail", "warn"))
     shown = [each for evidence in bad for each in evidence.pictures]
-    replace_file(out / "report.html", as_page(out, facts["first"], sections, more=_figures(shown)))
+    replace_file(out / "report.html", as_page(out, facts["first"], sections, more=figures(shown)))
     replace_file(out / "preflight.json", json.dumps(facts) + "\n")

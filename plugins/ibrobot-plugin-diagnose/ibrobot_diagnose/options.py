@@ -14,6 +14,9 @@ from ibrobot_core.app import Event, Shown
 KIND = "explanation"
 """The kind of report, for pages."""
 REPORT = "explanation.json"
+CHECK_KIND = "check"
+"""The kind of report on a dataset."""
+CHECK = "check.json"
 
 
 def _some(instance: object, attribute: object, paths: tuple[Path, ...]) -> None:
@@ -96,6 +99,9 @@ class CheckOptions:
     least: float = option(
         0.5, ge=0.05, le=1, label="Likelihood", more=True, help="likelihood from which an episode is listed"
     )
+    out: Path | None = option(
+        None, label="Folder", suggest="checks/{dataset}", help="folder for a report as HTML and JSON, with pictures"
+    )
     jobs: int | None = option(
         None, ge=1, label="Episodes at once", more=True, help="episodes in parallel; by default one for each CPU core"
     )
@@ -118,11 +124,12 @@ class CheckProgress(Event):
 class CheckReport(Event):
     """The result."""
 
+    out: str = option("", help="folder of the report; empty without one")
     lines: tuple[str, ...] = option(help="the listed episodes with their reasons, worst first")
 
     @override
     def shown(self) -> Shown:
-        return Shown("; ".join(self.lines[:3]), 1.0)
+        return Shown("; ".join(self.lines[:3]), 1.0, made={CHECK_KIND: self.out} if self.out else {})
 
 
 CHECK_EVENTS = (CheckProgress, CheckReport)

@@ -121,7 +121,7 @@ def finding_facts(each: Finding) -> dict[str, Any]:
         "name": each.name, "text": evidence.text, "number": _plain(evidence.number), "unit": evidence.unit,
         "threshold": _plain(evidence.threshold), "likelihood": round(evidence.likelihood, 4),
         "since_s": None if evidence.since_s is None else round(evidence.since_s, 3), "details": list(evidence.details),
-        "remedy": each.cause.remedy,
+        "remedy": each.cause.remedy, "mends": each.cause.mends,
     }  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections import Counter
@@ -173,3 +174,98 @@ def test_bright_scene_that_turns_white_is_named(data):
     )
     findings = {each.name for each in diagnose(window_of(white), bright).findings}
     assert "picture_bright" in findings
+
+
+def names_of(window, reference):
+    return {each.name for each in diagnose(window, reference).findings}
+
+
+def test_limit_that_demonstrations_had_too_is_not_too_low(data):
+    """Their own speed is at it, so speeds alone do not tell."""
+    slow = {"velocity": 0.3, **NONE}
+    demos = [window_of(Run(seed=each, acts=False, **slow), f"demo_{each}") for each in range(6)]
+    same = Reference(make_card(demos))
+    run = window_of(Run(seed=9320, outcome="failure", **slow))
+    assert "limits_low" not in names_of(run, same)
+    assert "limits_low" in names_of(run, data)
+    assert same.card is not None
+    assert "limits_low" in names_of(run, Reference(attrs.evolve(same.card, limits=None, speed=same.card.speed * 2)))
+
+
+def test_widest_limits_of_the_demonstrations_count():
+    demos = [
+        window_of(Run(seed=each, acts=False, velocity=velocity, **NONE), f"demo_{each}")
+        for each, velocity in enumerate((0.5, 4.0, 1.0))
+    ]
+    limits = make_card(demos).limits
+    assert limits is not None
+    assert {each.velocity for each in limits} == {4.0}
+
+
+def test_answers_of_noise_are_a_weak_policy(data):
+    """Neither their speed nor limits that they reach are faults of the set-up."""
+    rng = np.random.default_rng(0)
+
+    def noisy(chunk):
+        return chunk + rng.normal(0, 0.15, chunk.shape)
+
+    run = window_of(Run(seed=9321, answered=noisy, outcome="failure", **NONE))
+    diagnosis = diagnose(run, data)
+    assert diagnosis.first == "answers_tremble"
+    explained = Explanation.of(run, data, diagnosis)
+    assert explained.first.startswith("Nothing is wrong with the set-up; more or better data is what helps: ")
+
+
+def riding(data):
+    """The card of the same data, if the camera `top` were on the arm."""
+    (key,) = (each for each in data.card.cameras if each.endswith("top"))
+    moving = np.full_like(data.card.cameras[key].moving, 9)
+    cameras = {**data.card.cameras, key: attrs.evolve(data.card.cameras[key], moving=moving)}
+    return Reference(attrs.evolve(data.card, cameras=cameras))
+
+
+def test_camera_on_the_arm_is_compared_where_the_arm_stands_alike(data):
+    on_arm = riding(data)
+    moved = {**ONE, "moved": {"top": (12, 6, 0.1)}}
+    run = window_of(Run(seed=9322, outcome="failure", **moved))
+    assert "camera_moved" in names_of(run, data)
+    assert "camera_moved" not in names_of(run, on_arm)
+    hidden = window_of(Run(seed=9323, outcome="failure", picture=of_top(lambda shown: shown * 0 + 50), **ONE))
+    assert "picture_covered" in names_of(hidden, on_arm)
+    elsewhere = window_of(
+        Run(seed=9324, outcome="failure", start=(0.9,) * 4, seconds=3, cameras=("top",), camera_hz=5.0)
+    )
+    assert "picture_covered" not in names_of(elsewhere, on_arm)
+
+
+def test_joint_that_the_cameras_hardly_see_has_no_shifted_zero(data):
+    """Its positions at pictures that look the same differ from demonstration to demonstration."""
+    shifted = window_of(Run(seed=9325, zero={0: 0.35}, start=(0.35, 0, 0, 0), outcome="failure", **ONE))
+    assert "joint_zero" in names_of(shifted, data)
+    assert data.card is not None
+    rng = np.random.default_rng(1)
+    cameras = {}
+    for key, camera in data.card.cameras.items():
+        owners = [name for name, _ in camera.places]
+        apart = {name: rng.uniform(-0.5, 0.5) for name in dict.fromkeys(owners)}
+        poses = camera.poses + np.array([[apart[name], 0, 0, 0] for name in owners])
+        cameras[key] = attrs.evolve(camera, poses=poses)
+    assert "joint_zero" not in names_of(shifted, Reference(attrs.evolve(data.card, cameras=cameras)))
+
+
+def test_gripper_that_begins_at_its_other_end_is_reversed(data):
+    """Though it then hardly moves, so that its way says nothing."""
+    window = window_of(Run(seed=9326, outcome="failure", seen=lambda state: state, **NONE))
+    assert data.card is not None
+    begins = float(np.median(data.card.starts[:, 3]))
+    ends = {"lower": begins - 0.1, "upper": begins + 1.2}
+    document = {**window.document, "robot": {"joints": [{"name": "gripper", **ends}]}}
+    state = window.state.values.copy()
+    state[:, 3] = ends["lower"] + ends["upper"] - begins
+    window = attrs.evolve(
+        window,
+        state=attrs.evolve(window.state, values=state),
+        metadata={**window.metadata, "config": json.dumps(document)},
+    )
+    first, *_ = diagnose(window, data).findings
+    assert first.name == "gripper_reversed"

@@ -11,7 +11,7 @@ from importlib.util import find_spec
 import pytest
 import trainer
 from command_line import run_here
-from ibrobot_provenance.reports import ReportDescriptor, Text
+from ibrobot_provenance.reports import Cases, ReportDescriptor, Text
 from made_runs import Made, Run, metadata
 
 from ibrobot_core.api import DatasetError, EpisodeEnd, EpisodeStart
@@ -101,6 +101,58 @@ def test_check_lists_the_worst_episode_first(folder):
     assert checked["listed"][0]["episode"].endswith("episode_000009")
     assert checked["listed"][0]["causes"][0]["name"] == "idle_start"
     assert "idle_start" in checked["counts"]
+
+
+@pytest.mark.usefixtures("fork_server")
+def test_check_writes_a_report_with_what_mends_each_episode(folder, tmp_path):
+    from ibrobot_diagnose.check_contents import lines_of, read_contents
+
+    demos = tmp_path / "demos" / "episodes"
+    for number in range(3):
+        record(demos / f"episode_00000{number}", Run(seed=number, acts=False, seconds=5))
+    record(demos / "episode_000009", Run(seed=9, acts=False, seconds=14, idle_s=4.0, outcome="unknown"))
+    done = run_here("datasets", "check", tmp_path / "demos", "--out", tmp_path / "check", "--jobs", 1)
+    assert done.stdout.rstrip().endswith(f"report: {tmp_path / 'check' / 'report.html'}")
+    page = (tmp_path / "check" / "report.html").read_text()
+    assert page.count("<img") >= 2
+    assert not re.search(r"""(?:src|href)=["']?https?:""", page)
+    assert lines_of(tmp_path / "check")[0] in done.stdout
+    (shown,) = (each for each in read_contents(tmp_path / "check")[0].blocks if isinstance(each, Cases))
+    (case,) = (each for each in shown.cases if "episode_000009" in each.title)
+    assert case.episode == demos / "episode_000009"
+    cut, success, failure, drop = case.fixes
+    assert re.fullmatch(r"Cut the first 3\.\d s and the last \d\.\d s", cut.label)
+    assert (cut.does, cut.outcome) == ("trim", "unknown")
+    assert 3 < cut.begin_s < cut.end_s < 14
+    assert [(each.does, each.outcome) for each in (success, failure, drop)] == [
+        ("mark", "success"), ("mark", "failure"), ("delete", ""),
+    ]  # fmt: skip
+    trimmed = run_here("episodes", "trim", case.episode, "--from", cut.begin_s, "--to", cut.end_s, "--in-place")
+    assert trimmed.returncode == 0, trimmed.stderr
+    (shown,) = (each for each in read_contents(tmp_path / "check")[0].blocks if isinstance(each, Cases))
+    (case,) = (each for each in shown.cases if "episode_000009" in each.title)
+    assert case.fixes == ()
+    assert case.text.endswith("It has changed since the check.")
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("[]", "cannot be read: it has no first line"),
+        ("{", "cannot be read"),
+        ('{"first": "x"}', "is not a check of a dataset"),
+        ('{"first": "x", "listed": [{}], "paths": ["a"], "folders": [0]}', "is not a check of a dataset"),
+        ('{"first": "x", "listed": [{"causes": []}], "paths": ["a"], "folders": [0]}', "is not a check of a dataset"),
+    ],
+)
+def test_damaged_check_is_named(tmp_path, text, problem):
+    descriptor = installed_plugins().find("report", "check")
+    assert isinstance(descriptor, ReportDescriptor)
+    assert not descriptor.reads(tmp_path)
+    (tmp_path / "check.json").write_text(text)
+    assert descriptor.reads(tmp_path)
+    with pytest.raises(DatasetError, match=rf"check\.json: {problem}"):
+        descriptor.make(tmp_path)
 
 
 def test_card_of_a_dataset_is_made_and_used(folder, tmp_path):

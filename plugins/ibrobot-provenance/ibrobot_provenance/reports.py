@@ -49,6 +49,19 @@ class Cases:
 
 
 @attrs.frozen
+class Fix:
+    """What a click on a page does to an episode; the same page can undo it."""
+
+    label: str
+    does: Literal["delete", "trim", "mark"]
+    outcome: str = ""
+    """What it is judged, for `mark`, and after a `trim` that cuts the end off, with which a recording loses its own."""
+    begin_s: float = 0.0
+    """The part that a `trim` keeps [s]."""
+    end_s: float = 0.0
+
+
+@attrs.frozen
 class Case:
     """An episode worth a look."""
 
@@ -59,6 +72,10 @@ class Case:
     video: Path | None = None
     command: str = ""
     """The command that repeats it."""
+    at_s: float = 0.0
+    """Where to begin to play the recording [s]."""
+    fixes: tuple[Fix, ...] = ()
+    """What can be done to the recording, the likeliest first."""
 
 
 @attrs.frozen

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from ibrobot_diagnose.cause import Cause
-from ibrobot_diagnose.causes import data, episodes, joints, limits, model, motion, pictures, rig, timing
+from ibrobot_diagnose.causes import data, episodes, joints, limits, model, motion, others, pictures, rig, timing
 
-_FAMILIES = (timing, limits, motion, pictures, joints, data, episodes, model, rig)
+_FAMILIES = (timing, limits, motion, pictures, joints, data, episodes, model, rig, others)
 
 
 def all_causes() -> tuple[Cause, ...]:

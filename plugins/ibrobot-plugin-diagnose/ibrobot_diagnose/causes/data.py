@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import override
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ibrobot_diagnose.card import Card, moving_speed
+from ibrobot_diagnose.card import Card, moving_speed, speed_of
 from ibrobot_diagnose.cause import CardCause, Cause, Evidence, likelihood
 from ibrobot_diagnose.causes.pictures import pairs
 from ibrobot_diagnose.course import begins_to_move
-from ibrobot_diagnose.window import Window
+from ibrobot_diagnose.window import Times, Window
 
 
 class OtherPrompt(CardCause):
@@ -132,14 +133,13 @@ class OtherSpeed(CardCause):
 
 
 def _chunk_speed(window: Window) -> float:
-    """Mean speed of the model's answers where they move, over the joints [rad/s]; 0 without any."""
+    """Speed of the model's answers over the joints, see `speed_of` [rad/s]; 0 without any."""
     speeds = [
         np.abs(np.diff(each.chunk, axis=0)).sum(axis=1) * (1e9 / each.answer.step_ns)
         for each in window.asked
         if each.used and each.answer.joint_names == window.joints
     ]
-    moving = np.concatenate([np.zeros(1), *(each[each > 0.1] for each in speeds)])[1:]
-    return float(moving.mean()) if len(moving) else 0.0
+    return speed_of(np.concatenate([np.zeros(1), *speeds]))
 
 
 _SLOWS = frozenset({
@@ -262,9 +262,9 @@ class UnseenSuccess(CardCause):
 
     @override
     def compare(self, window: Window, card: Card) -> Evidence | None:
-        if window.outcome != "failure":
+        if window.outcome != "failure" or window.joints != card.joints:
             return None
-        best: tuple[float, str] | None = None
+        best: tuple[float, str, float] | None = None
         for pair in pairs(window, card):
             owners = [name for name, _ in pair.card.places]
             firsts = [i for i, name in enumerate(owners) if not i or owners[i - 1] != name]
@@ -278,19 +278,60 @@ class UnseenSuccess(CardCause):
                 continue
             scores = [(each - np.median(begin, axis=0)) @ way / size for each in (begin, end)]
             apart = (scores[1].mean() - scores[0].mean()) / (scores[0].std() + scores[1].std() + 1e-3)
-            shown = pair.camera.small[-5:].reshape(min(5, len(pair.camera.small)), -1)
-            score = float(np.median((shown - np.median(begin, axis=0)) @ way / size))
-            if apart > 3.0 and (best is None or score > best[0]):
-                best = score, pair.camera.name
-        if best is None:
+            if apart <= 3.0:
+                continue
+            ended = self._ended(window, card, np.array(pair.camera.times_ns, np.int64))
+            shown = pair.camera.small.reshape(len(pair.camera.small), -1)
+            along = (shown - np.median(begin, axis=0)) @ way / size
+            if ended.any():
+                i = int(np.argmax(np.where(ended, along, -np.inf)))
+                score = float(np.median(along[ended & (np.abs(np.arange(len(along)) - i) < _BESIDE)]))
+                if best is None or score > best[0]:
+                    best = score, pair.camera.name, window.since(pair.camera.times_ns[i])
+        if best is None or not _handled(window, card):
             return None
-        score, name = best
+        score, name, at_s = best
         text = (
-            f"The last pictures of {name} look like the ends of successful episodes ({100 * score:.0f} % of the way "
-            "from their "
-            "beginnings), but the run was judged a failure."
+            f"At {at_s:.1f} s the arm stands, and the pictures of {name} look, as at the ends of successful episodes "
+            f"({100 * score:.0f} % of the way from their beginnings), but the run was judged a failure."
         )
-        return Evidence(text, 100 * score, "%", 80.0, likelihood(max(score, 0.0), 0.8, 0.95))
+        return Evidence(text, 100 * score, "%", 80.0, likelihood(max(score, 0.0), 0.8, 0.95), at_s)
+
+    @staticmethod
+    def _ended(window: Window, card: Card, times_ns: Times) -> NDArray[np.bool_]:
+        """At which times the arm stands where episodes of the data end."""
+        states = window.state.at(times_ns)
+        low, high = card.ends.min(axis=0), card.ends.max(axis=0)
+        room = 0.05 + 0.25 * (high - low)
+        with np.errstate(invalid="ignore"):
+            result: NDArray[np.bool_] = ((states >= low - room) & (states <= high + room)).all(axis=1)
+        return result
+
+
+_BESIDE = 3
+"""Pictures before and after the one that looks most like an end, of which the middle one counts."""
+_GAP = 0.05
+"""How far a gripper that holds something stays from its command [rad]."""
+
+
+def _handled(window: Window, card: Card) -> bool:
+    """Whether the gripper held something, if it does in the data: an arm that ends there with nothing has done nothing.
+
+    A gripper that holds something does not reach its command.
+    """
+    for j in (i for i, joint in enumerate(card.joints) if "grip" in joint or "jaw" in joint):
+        usual = float(card.row(card.lead, 0.95)[j])
+        if usual < _GAP:
+            continue
+        gaps = np.abs(window.commands[:, j] - window.states[:, j])
+        gaps = gaps[np.isfinite(gaps)]
+        if not len(gaps) or float((gaps > 0.5 * usual).mean()) < _HELD:
+            return False
+    return True
+
+
+_HELD = 0.05
+"""Share of a run from which a gripper has held something, and not only moved."""
 
 
 CAUSES: tuple[type[Cause], ...] = (

@@ -40,6 +40,7 @@ class IdleStart(_Still):
         "idle_start_s",
         "at the beginning",
     )
+    mends = "trim start"
     remedy = "Cut it: `ibrobot episodes trim EPISODE --from SECONDS`; a policy learns to wait from it."
 
 
@@ -47,6 +48,7 @@ class IdleEnd(_Still):
     """The episode ends with time in which nothing moves."""
 
     name, title, series, where = "idle_end", "the episode ends soon after the motion", "idle_end_s", "at the end"
+    mends = "trim end"
     remedy = "Cut it: `ibrobot episodes trim EPISODE --to SECONDS`."
 
 
@@ -234,6 +236,7 @@ class NotJudged(Cause):
 
     name, title = "not_judged", "the episode is judged"
     needs = frozenset({"demonstration"})
+    mends = "judge"
     remedy = "Look at it and judge it: `ibrobot episodes mark EPISODE success`."
 
     @override

@@ -16,6 +16,8 @@ from ibrobot_diagnose.window import Floats, Window
 
 _MIDDLE = slice(1, -1)
 """Levels of the quantiles that are compared."""
+_REPEATS = 0.6
+"""Usual distance up to which pictures of a camera repeat, so that they say something of the pose."""
 _CONSEQUENCES = frozenset({
     "unseen_start", "unseen_states", "other_speed", "statistics", "limits_low", "stands_still", "arm_not_following",
 })  # fmt: skip
@@ -47,7 +49,7 @@ def nearest_poses(window: Window, card: Card) -> tuple[Floats, Floats]:
     """Positions of the joints in the window, and those of the data at pictures that look the same; shape (N, J)."""
     own, theirs = [], []
     for pair in pairs(window, card):
-        if pair.card.usual_distance > 0.6:  # its pictures hardly repeat, so that they say nothing of the pose
+        if pair.card.usual_distance > _REPEATS:
             continue
         times = np.array(pair.camera.times_ns, np.int64)
         index = np.unique(np.linspace(0, len(times) - 1, min(120, len(times))).round().astype(int))
@@ -58,6 +60,29 @@ def nearest_poses(window: Window, card: Card) -> tuple[Floats, Floats]:
         theirs.append(pair.card.poses[near[good]])
     size = len(window.joints)
     return (np.concatenate(own), np.concatenate(theirs)) if own else (np.empty((0, size)), np.empty((0, size)))
+
+
+def usual_offsets(card: Card) -> Floats:
+    """How far the positions of an episode of the data are from those of the others at pictures that look the same.
+
+    Of nearly all episodes [rad], shape (J,): a joint that the cameras hardly see differs from episode to episode.
+    """
+    offsets = []
+    for camera in card.cameras.values():
+        if camera.usual_distance > _REPEATS:
+            continue
+        owners = np.array([name for name, _ in camera.places])
+        for owner in np.unique(owners).tolist():
+            own, others = owners == owner, owners != owner
+            if not others.any():
+                continue
+            distance, near = nearest(camera.vectors[own], camera.vectors[others])
+            good = distance < 1.5 * camera.usual_distance
+            if good.any():
+                offsets.append(np.median(camera.poses[own][good] - camera.poses[others][near[good]], axis=0))
+    size = len(card.joints)
+    result: Floats = np.quantile(np.abs(offsets), 0.95, axis=0) if offsets else np.zeros(size)
+    return result
 
 
 class OtherUnits(CardCause):
@@ -199,7 +224,7 @@ class JointZero(CardCause):
         differences = own - theirs
         middle = np.median(differences, axis=0)
         spread = 1.4826 * np.median(np.abs(differences - middle), axis=0)
-        sure = np.abs(middle) / (0.04 + 0.5 * spread)
+        sure = np.abs(middle) / (0.04 + 0.5 * spread + usual_offsets(card))
         j = int(np.argmax(sure))
         others = np.delete(sure, j)
         text = (
@@ -276,11 +301,24 @@ class GripperReversed(CardCause):
         first = [abs(float(each[0, 0]) - start) / span for each in (own, mirrored)]
         plain, other = (cost + begin for cost, begin in zip(costs, first, strict=True))
         ratio = (plain + 0.08) / (other + 0.08) if plain > 0.35 and first[0] > 0.25 else 0.5
+        rest = np.delete(np.abs(_known(window)[0] - np.median(card.starts, axis=0)), j)
+        exact = abs(self._turned(window, card, j, float(own[0, 0])) - start) / span
+        if first[0] > 0.5 and exact < 0.05 and rest.max(initial=0.0) < 0.1:
+            # All other joints begin as usual, and this one exactly where its two ends exchanged put its start.
+            ratio = max(ratio, (first[0] + 0.08) / (exact + 0.08))
         text = (
             f"The gripper is reversed: it begins at {own[0, 0]:.2f} rad where the data begins at {start:.2f}, and the "
             f"mirror image of its way is {ratio:.1f} times as close to the data."
         )
         return Evidence(text, ratio, "times", 2.0, likelihood(ratio, 2.0, 3.5))
+
+    @staticmethod
+    def _turned(window: Window, card: Card, j: int, position: float) -> float:
+        """A position with the two ends exchanged: those of the joint's limits, else those of the data [rad]."""
+        limits = window.limits[j]
+        if np.isfinite(limits.lower) and np.isfinite(limits.upper):
+            return limits.lower + limits.upper - position
+        return float(card.row(card.state, 0.0)[j] + card.row(card.state, 1.0)[j]) - position
 
 
 CAUSES: tuple[type[Cause], ...] = (

@@ -13,6 +13,9 @@ from ibrobot_diagnose.cause import Cause, Evidence, Reference, likelihood
 from ibrobot_diagnose.course import course_of, operated_share
 from ibrobot_diagnose.window import Limits, Window
 
+_SAME = 0.2
+"""Likelihood that a limit is too low that was the same when the data was recorded."""
+
 
 class LimitsLow(Cause):
     """A limit keeps the arm from what the model says."""
@@ -57,6 +60,11 @@ class LimitsLow(Cause):
 
 def _needed(kind: str, joint: int, limits: Limits, card: Card) -> float:
     """Likelihood that demonstrations exceed a limit; one that they keep is not too low: the model asks for more."""
+    known = Limits() if card.limits is None else card.limits[joint]
+    if kind == "velocity" and known.velocity <= 1.01 * limits.velocity:
+        return _SAME  # the robot had it when the data was recorded
+    if kind == "position" and known.lower >= limits.lower - 0.01 and known.upper <= limits.upper + 0.01:
+        return _SAME
     if kind == "velocity":
         usual = float(card.row(card.speed, 0.99)[joint])
         return likelihood(usual / max(limits.velocity, 1e-6), 1.0, 1.3)

@@ -121,4 +121,38 @@ class StandsStill(Cause):
         return Evidence(text, still, "s", threshold, max(strength, 0.9) if whole and still > 1.0 else strength)
 
 
-CAUSES: tuple[type[Cause], ...] = (ArmNotFollowing, SmoothingAverages, StandsStill)
+class AnswersTremble(Cause):
+    """The model answers with noise around a motion."""
+
+    name = "answers_tremble"
+    title = "the model's answers are motions"
+    weak = True
+    needs = frozenset({"chunks"})
+    explains = frozenset({"other_speed", "limits_low", "smoothing_averages", "unseen_states", "arm_not_following"})
+    remedy = (
+        "Train longer, on more data; for a diffusion policy look at its denoising steps, too. Nothing of the robot "
+        "makes answers like these."
+    )
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        net = way = 0.0
+        for each in (one for one in window.asked if one.used):
+            back = max(1, round(0.2e9 / each.answer.step_ns))
+            steps = np.abs(np.diff(each.chunk, axis=0))
+            if len(steps) < 2 * back:
+                continue
+            net += float(np.abs(each.chunk[back:] - each.chunk[:-back]).sum())
+            total = np.cumsum(np.concatenate([np.zeros((1, steps.shape[1])), steps]), axis=0)
+            way += float((total[back:] - total[:-back]).sum())
+        if way < 0.1:
+            return None
+        share = net / way
+        text = (
+            f"The model's answers tremble: of the way that they go in 0.2 s, only {100 * share:.0f} % leads anywhere; "
+            "of a motion it is more than half."
+        )
+        return Evidence(text, 100 * share, "%", 50.0, likelihood(share, 0.5, 0.3))
+
+
+CAUSES: tuple[type[Cause], ...] = (ArmNotFollowing, SmoothingAverages, StandsStill, AnswersTremble)

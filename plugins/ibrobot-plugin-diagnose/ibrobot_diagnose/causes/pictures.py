@@ -24,8 +24,12 @@ from ibrobot_diagnose.causes.moved import FAILS, WARNS, Sight, sights
 from ibrobot_diagnose.looks import Looks
 from ibrobot_diagnose.pictures import descriptors, nearest, resized
 from ibrobot_diagnose.rig import Rig
-from ibrobot_diagnose.window import Camera, Window
+from ibrobot_diagnose.window import COMPARED, Camera, Window
 
+_IN_HAND = 20.0
+"""Share of the picture of a camera on the arm that may be empty if the arm holds nothing [%]."""
+_ALIKE = 0.15
+"""Difference of all joints below which the arm stands alike [rad]."""
 UNSEEN = frozenset({"unseen_pictures", "camera_ignored"})
 
 
@@ -35,6 +39,24 @@ class Pair:
 
     camera: Camera
     card: CameraCard
+    window: Window
+
+    def at_like_poses(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None:
+        """Pictures of the run and of the data at which the arm stands alike, shape (N, 24, 32, 3) each.
+
+        None for fewer than five.
+        """
+        count = len(self.camera.pictures)
+        index = np.unique(np.linspace(0, count - 1, min(COMPARED, count)).round().astype(int))
+        poses = self.window.state.at(np.array(self.camera.times_ns, np.int64)[index])
+        if poses.shape[1] != self.card.poses.shape[1]:
+            return None
+        apart = np.nan_to_num(np.abs(poses[:, None] - self.card.poses[None]), nan=np.inf).max(axis=2)
+        near, alike = apart.argmin(axis=1), apart.min(axis=1) < _ALIKE
+        if alike.sum() < 5:
+            return None
+        own = np.stack([self.camera.pictures[i].small for i in index[alike].tolist()])
+        return own, self.card.thumbnails[near[alike]]
 
     def distance(self, changed: Callable[[Any], Any] = lambda small: small) -> float:
         """Median distance to the nearest thumbnail of the data, of pictures that are changed first."""
@@ -58,7 +80,7 @@ def pairs(window: Window, card: Card) -> Iterator[Pair]:
     for key, known in card.cameras.items():
         camera = window.cameras.get(key)
         if camera is not None and camera.pictures:
-            yield Pair(camera, known)
+            yield Pair(camera, known, window)
 
 
 class PictureCause(CardCause):
@@ -131,7 +153,9 @@ class CamerasExchanged(CardCause):
             for b in range(a + 1, len(each)):
                 one, other = each[a], each[b]
                 own = one.distance() + other.distance()
-                crossed = Pair(one.camera, other.card).distance() + Pair(other.camera, one.card).distance()
+                crossed = sum(
+                    Pair(*both, window).distance() for both in ((one.camera, other.card), (other.camera, one.card))
+                )
                 ratio = own / max(crossed, 1e-3)
                 if best is None or ratio > best[0]:
                     best = ratio, one, other
@@ -178,6 +202,8 @@ class CameraMoved(PictureCause):
 
     @override
     def measure(self, pair: Pair) -> tuple[float, str] | None:
+        if pair.card.rides:
+            return None  # it moves with the arm; preflight compares it at the same pose
         shift = shift_between(pair)
         name = pair.camera.name
         if shift is None:
@@ -299,6 +325,8 @@ class PictureCovered(PictureCause):
 
     @override
     def measure(self, pair: Pair) -> tuple[float, str] | None:
+        if pair.card.rides:
+            return self._of_riding(pair)
         middles = [np.median(each, axis=0).mean(axis=2) for each in (pair.camera.sample, pair.card.thumbnails)]
         own, known = (_texture(each) for each in middles)
         rich = known > max(6.0, 0.4 * float(np.median(known)))
@@ -313,6 +341,22 @@ class PictureCovered(PictureCause):
         shift = shift_between(pair) if share > 10 else None
         if other or (shift is not None and shift.after > 0.45 and shift.after > shift.before + 0.1):
             return 0.0, ""  # another view, not this one with something before it
+        text = f"Something covers {share:.0f} % of the picture of {pair.camera.name}: there is nothing to see there."
+        return share, text
+
+    @staticmethod
+    def _of_riding(pair: Pair) -> tuple[float, str] | None:
+        """For a camera on the arm, which sees another part of the scene in each pose."""
+        alike = pair.at_like_poses()
+        if alike is None:
+            return None
+        known = np.median([_texture(each.mean(axis=2)) for each in alike[1]], axis=0)
+        # An object that the arm does not hold leaves an area empty in some pictures, what covers it in nearly all.
+        own = np.quantile([_texture(each.mean(axis=2)) for each in pair.camera.sample], 0.9, axis=0)
+        rich = known > max(6.0, 0.4 * float(np.median(known)))
+        if rich.sum() < 6:
+            return None
+        share = max(0.0, 100 * float((own < 0.3 * known)[rich].mean()) - _IN_HAND)
         text = f"Something covers {share:.0f} % of the picture of {pair.camera.name}: there is nothing to see there."
         return share, text
 
@@ -355,7 +399,14 @@ class PictureFrozen(Cause):
             f"The picture of {camera.name} froze: the same one came for {seconds:.1f} s while the arm moved; up to "
             f"{usual:.1f} s are usual."
         )
-        return Evidence(text, seconds, "s", usual, likelihood(seconds, usual, 3.0 * usual), since)
+        # All that is said of its pictures is said of one; but one that is always the same may be dark or covered.
+        explains = self.explains | (_OF_ONE if seconds < 0.8 * window.seconds else frozenset())
+        return Evidence(
+            text, seconds, "s", usual, likelihood(seconds, usual, 3.0 * usual), since, explains=explains
+        )  # fmt: skip
+
+
+_OF_ONE = frozenset({"picture_covered", "picture_dark", "picture_bright", "picture_blurred", "camera_moved"})
 
 
 class WhiteBalance(PictureCause):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -14,14 +14,17 @@ from ibrobot_provenance.jobs import Job, open_pool
 from ibrobot_core.api import DatasetError
 from ibrobot_core.app import Emit, Unsuccessful, echo, wrong_input
 from ibrobot_diagnose.card import Card, Maker
-from ibrobot_diagnose.cause import Reference
+from ibrobot_diagnose.cause import Reference, Shown
 from ibrobot_diagnose.diagnosis import diagnose
 from ibrobot_diagnose.options import CheckOptions, CheckProgress, CheckReport
 from ibrobot_diagnose.references import find_episodes, read_episode
 from ibrobot_diagnose.report import finding_facts
+from ibrobot_diagnose.window import Window
 
 _PARTS = 5
 """The episodes of a part are compared with the ones of the other parts."""
+_MOST = 4
+"""Pictures of an episode in the report."""
 
 
 @attrs.frozen(kw_only=True)
@@ -39,9 +42,13 @@ class CheckDataset(CheckOptions):
         episodes = find_episodes([self.dataset])
         if len(episodes) < 2:
             raise DatasetError(f"{self.dataset}: has {len(episodes)} episodes; at least 2 are needed to compare them")
-        checked = _checked(self, episodes, emit)
+        checked, shown = _checked(self, episodes, emit)
+        if self.out is not None:
+            from ibrobot_diagnose.check_contents import write_check
+
+            write_check(self.out, checked, lines_of(checked), shown)
         if emit is not None:
-            emit(CheckReport(lines=tuple(_lines(checked))))
+            emit(CheckReport(out=str(self.out or ""), lines=tuple(lines_of(checked))))
             return None
         if checked["unreadable"]:
             for each in checked["unreadable"]:
@@ -51,12 +58,16 @@ class CheckDataset(CheckOptions):
 
     def show(self, checked: dict[str, Any]) -> None:
         """Print the listed episodes."""
-        for line in _lines(checked):
+        for line in lines_of(checked):
             echo(line)
+        if self.out is not None:
+            echo(f"report: {self.out / 'report.html'}")
 
 
-def _checked(options: CheckOptions, episodes: Sequence[Path], emit: Emit) -> dict[str, Any]:
-    """Check the episodes; the facts of those with findings, worst first."""
+def _checked(
+    options: CheckOptions, episodes: Sequence[Path], emit: Emit
+) -> tuple[dict[str, Any], dict[str, list[Shown]]]:
+    """Check the episodes: the facts of those with findings, worst first, and the pictures of each."""
     done, unreadable = 0, []
 
     def tell() -> None:
@@ -79,18 +90,21 @@ def _checked(options: CheckOptions, episodes: Sequence[Path], emit: Emit) -> dic
     parts = min(_PARTS, len(readable))
     cards = [_card([makers[each] for i, each in enumerate(readable) if i % parts != part]) for part in range(parts)]
     jobs = [Job(check_episode, (each, cards[i % parts])) for i, each in enumerate(readable)]
-    results = {episode: causes for episode, causes in run(jobs)}
+    results = {episode: result for episode, result in run(jobs)}
     listed = []
-    for episode in readable:
-        causes = [each for each in results.get(episode, ()) if each["likelihood"] >= options.least]
+    for episode in (each for each in readable if each in results):
+        result = results[episode]
+        causes = [each for each in result.causes if each["likelihood"] >= options.least]
         if causes:
-            listed.append({"episode": str(episode), "causes": causes})
+            facts = {"outcome": result.outcome, "seconds": round(result.seconds, 3)}
+            listed.append({"episode": str(episode), **facts, "causes": causes})
     listed.sort(key=lambda each: (-each["causes"][0]["likelihood"], -len(each["causes"]), each["episode"]))
     counts = Counter(cause["name"] for each in listed for cause in each["causes"])
-    return {
+    checked = {
         "dataset": str(options.dataset), "episodes": len(episodes), "listed": listed,
         "counts": dict(counts.most_common()), "unreadable": unreadable,
     }  # fmt: skip
+    return checked, {each["episode"]: results[Path(each["episode"])].shown for each in listed}
 
 
 def _card(makers: Sequence[Maker]) -> Card:
@@ -111,16 +125,43 @@ def summarise(order: tuple[Path], progress: Callable[[int], None] = lambda more:
     return maker
 
 
-def check_episode(
-    order: tuple[Path, Card], progress: Callable[[int], None] = lambda more: None
-) -> list[dict[str, Any]]:
-    """The facts of an episode's findings, most probable first."""
+@attrs.frozen
+class Checked:
+    """An episode that was checked."""
+
+    outcome: str
+    seconds: float
+    causes: list[dict[str, Any]]
+    """The facts of its findings, most probable first."""
+    shown: list[Shown]
+    """Pictures of the most probable one, or of the episode."""
+
+
+def check_episode(order: tuple[Path, Card], progress: Callable[[int], None] = lambda more: None) -> Checked:
+    """Compare an episode with the others.
+
+    Raises:
+        RecorderError: if it cannot be read.
+    """
     episode, card = order
-    diagnosis = diagnose(read_episode(episode), Reference(card))
-    return [finding_facts(each) for each in diagnosis.findings]
+    window = read_episode(episode)
+    findings = diagnose(window, Reference(card)).findings
+    shown = list(findings[0].evidence.pictures) if findings else []
+    if findings and not shown:
+        shown = list(_seen(window, findings[0].evidence.since_s or 0.0))
+    return Checked(window.outcome, window.seconds, [finding_facts(each) for each in findings], shown[:_MOST])
 
 
-def _lines(checked: dict[str, Any]) -> list[str]:
+def _seen(window: Window, at_s: float) -> Iterator[Shown]:
+    """What each camera saw at a time."""
+    for camera in window.cameras.values():
+        if camera.kept:
+            near = min(camera.kept, key=lambda i: abs(window.since(camera.times_ns[i]) - at_s))
+            yield Shown(f"{camera.name} at {window.since(camera.times_ns[near]):.1f} s", camera.kept[near])
+
+
+def lines_of(checked: Mapping[str, Any]) -> list[str]:
+    """A line for each listed episode, worst first, and the counts."""
     listed = checked["listed"]
     if not listed:
         return [f"All {checked['episodes']} episodes are like one another: nothing was found."]

@@ -73,14 +73,16 @@ def _block(ui: Ui, block: Text | Table | Plots | Cases) -> dict[str, Any]:
 def _case(ui: Ui, case: Case) -> dict[str, Any]:
     return {
         "title": case.title, "text": case.text, "command": case.command, "episode": _name(ui, case.episode),
-        "video": _name(ui, case.video),
+        "video": _name(ui, case.video), "at_s": case.at_s, "fixes": [attrs.asdict(each) for each in case.fixes],
     }  # fmt: skip
 
 
 def _name(ui: Ui, path: Path | None) -> str:
-    """A path for requests; empty if it is outside the opened folders, or there is nothing."""
+    """A path for requests, also `DATASET:N`; empty if it is outside the opened folders, or there is nothing."""
+    if path is None or not (path.exists() or path.with_name(path.name.rpartition(":")[0] or path.name).exists()):
+        return ""
     try:
-        return ui.folders.name(ui.folders.find(str(path))) if path and path.exists() else ""
+        return ui.folders.name(ui.folders.find(str(path)))
     except IbrobotError:
         return ""
 

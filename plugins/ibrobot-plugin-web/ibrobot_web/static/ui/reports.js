@@ -13,15 +13,17 @@ export class View {
     this.name = name;
     this.title = title;
     this.kind = report;
+    this.mended = new Map(); // report and case -> what a click did to its recording, and how to undo that
   }
 
   mount(element) {
     this.note = h("p", { class: "note", role: "status" });
     this.list = scroll(this.title);
     this.player = new Player(this.ui);
+    this.mending = h("div", { class: "row" });
     this.playing = h("section", { class: "card", hidden: true, "aria-label": "Recording" },
       h("div", { class: "row" }, this.recording = h("h3", {}), h("button", { onclick: () => this.play("") }, "Close")),
-      this.problem = h("div", {}), this.player.element);
+      this.problem = h("div", {}), this.player.element, this.mending);
     this.head = h("h2", { tabindex: "-1" });
     this.body = h("div", {});
     this.detail = h("section", { class: "card report", hidden: true, "aria-label": "Report" },
@@ -71,7 +73,12 @@ export class View {
       return;
     }
     if (this.path !== path) return; // another one was opened meanwhile
-    refresh(this.body, sections, () => sections.map(({ title, blocks }, i) => (
+    this.sections = sections;
+    this.draw();
+  }
+
+  draw() {
+    refresh(this.body, [this.sections, [...this.mended], this.ui.drives], () => this.sections.map(({ title, blocks }, i) => (
       h("section", { "aria-label": title }, i ? h("h3", {}, title) : null, blocks.map((block) => this.block(block, title))))));
   }
 
@@ -86,20 +93,76 @@ export class View {
     }
   }
 
-  case({ title, text, episode, video, command }) {
+  case(each) {
+    const { title, text, episode, video, command, at_s: at } = each;
     return h("article", { class: "case" }, h("h4", {}, title),
       video ? h("video", { src: `${this.ui.address("reports/video", { path: video })}#t=0.01`, controls: true, muted: true, preload: "metadata", "aria-label": `Video of ${title}` }) : null,
       h("p", {}, text),
       episode ? h("p", {}, h("a", { href: `#episodes/${encodeURIComponent(episode)}` }, episode)) : null,
       command ? h("code", {}, command) : null,
       h("div", { class: "row" },
-        episode ? h("button", { "aria-label": `Play the recording of ${title}`, onclick: (event) => this.play(episode, title, event.target) }, "Play the recording") : null,
-        command ? h("button", { "aria-label": `Copy the command of ${title}`, onclick: () => copy(command) }, "Copy the command") : null));
+        episode ? h("button", { "aria-label": `Play the recording of ${title}`, onclick: (event) => this.play(episode, title, event.target, at, each) }, "Play the recording") : null,
+        command ? h("button", { "aria-label": `Copy the command of ${title}`, onclick: () => copy(command) }, "Copy the command") : null,
+        this.fixes(each)));
+  }
+
+  // Buttons that mend a recording, or what was done and a button that undoes it.
+  fixes({ title, episode, fixes }) {
+    const done = this.mended.get(this.keyOf(title));
+    if (done) {
+      return [h("span", { class: "note", role: "status" }, done.label),
+        h("button", { disabled: !this.ui.drives, "aria-label": `Undo what was done to ${title}`, onclick: () => this.undo(title) }, "Undo")];
+    }
+    return episode ? fixes.map((fix) => h("button", {
+      class: fix.does === "delete" ? "danger" : "", disabled: !this.ui.drives, "aria-label": `${fix.label}: ${title}`,
+      onclick: () => this.mend(title, episode, fix),
+    }, fix.label)) : [];
+  }
+
+  keyOf(title) { return `${this.path}: ${title}`; }
+
+  async mend(title, path, { label, does, outcome, begin_s, end_s }) {
+    const folder = path.includes("/") ? path.slice(0, path.lastIndexOf("/")) : ".";
+    const before = does === "mark" ? await this.ui.attempt(() => this.ui.get("episodes/open", { path })) : { outcome };
+    if (!before) return;
+    const answer = await this.ui.attempt(async () => {
+      if (does === "delete") return this.ui.post("episodes/delete", { paths: [path] });
+      if (does === "trim") await this.ui.post("episodes/trim", { path, begin_s, end_s });
+      return does === "trim" && !outcome ? null : this.ui.post("episodes/mark", { paths: [path], outcome });
+    });
+    if (answer === undefined) return;
+    this.mended.set(this.keyOf(title), { label, does, path, folder, outcome: before.outcome });
+    if (does === "delete" && this.player.path === path) this.player.close();
+    this.draw();
+    this.drawMending();
+  }
+
+  // Puts the original back, or judges as before.
+  async undo(title) {
+    const { does, path, folder, outcome } = this.mended.get(this.keyOf(title));
+    const answer = await this.ui.attempt(async () => {
+      if (does === "mark") return this.ui.post("episodes/mark", { paths: [path], outcome });
+      const trashed = await this.ui.get("episodes/trash", { path: folder });
+      const original = trashed.find((each) => each.path === path);
+      if (!original) throw new Error(`${path}: the trash has no original`);
+      return this.ui.post("episodes/restore", { path: folder, id: original.id });
+    });
+    if (answer === undefined) return;
+    this.mended.delete(this.keyOf(title));
+    this.draw();
+    this.drawMending();
+  }
+
+  // The same buttons beside the player.
+  drawMending() {
+    this.mending.replaceChildren(...(this.played ? this.fixes(this.played) : []));
   }
 
   // Plays a recording until it is closed, which leads back to where it was opened.
-  async play(path, title = "", from = null) {
+  async play(path, title = "", from = null, at = 0, played = null) {
     this.playing.hidden = !path;
+    this.played = played;
+    this.drawMending();
     const opener = this.from;
     this.from = from;
     if (!path) {
@@ -109,7 +172,10 @@ export class View {
     }
     say(this.recording, title);
     this.problem.replaceChildren();
-    if (await this.player.open(path, this.problem)) this.player.toggle();
+    if (await this.player.open(path, this.problem)) {
+      if (at > 0) this.player.seek(Math.min(at, this.player.length));
+      this.player.toggle();
+    }
     this.playing.scrollIntoView({ block: "start" });
   }
 }
