@@ -98,7 +98,7 @@ def prepare(work: Path, episodes: int, policies: Sequence[str]) -> None:
     for name, dataset, words in (
         ("state", state, ("--steps", "900", *least, "--policy.optimizer_lr=1e-4")),
         *((f"early-{steps}", state, ("--steps", str(steps), *least)) for steps in EARLY),
-        ("diffusion", state, ("--policy", "diffusion", "--steps", "900", *small)),
+        ("diffusion", state, ("--policy", "diffusion", "--steps", "300", *small)),
         ("pictures", pictures, ("--steps", "300", "--batch-size", "8", *least)),
     ):
         if name in policies and not (work / name / "checkpoints/last").exists():

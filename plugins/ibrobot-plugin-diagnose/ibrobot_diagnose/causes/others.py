@@ -88,8 +88,8 @@ class LerobotLint(_Tool):
         episode = EpisodeData(
             states.astype(np.float32), actions.astype(np.float32), times, rate, window.prompt, camera_handles={}
         )
-        found = _checks_of_lint(window.joints).run_all(episode, 0)
-        return [f"{each.check}: {each.message}" for each in found if each.severity in ("error", "warning")]
+        flags = _checks_of_lint(window.joints).run_all(episode, 0)
+        return [f"{each.check}: {each.message}" for each in flags if each.severity in ("error", "warning")]
 
 
 TOOLS: tuple[type[_Tool], ...] = (LerobotDoctor, LerobotLint)
