@@ -221,6 +221,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=REPORTED, help="first seed of the runs that count")
     parser.add_argument("--tune", action="store_true", help="the seeds on which thresholds may be chosen")
     parser.add_argument("--only", nargs="*", help="some causes")
+    parser.add_argument("--strengths", nargs="*", default=STRENGTHS, choices=STRENGTHS, help="some of these")
     parser.add_argument("--policies", nargs="*", default=POLICIES, help="some of these")
     arguments = parser.parse_args()
     work = arguments.work.absolute()

@@ -74,9 +74,16 @@ def diagnose(
 
 
 def ranked(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Findings by likelihood, each after those that explain it; what explains another is at least as likely."""
+    """Findings by likelihood, each after those that explain it; what explains another is at least as likely.
+
+    Except for a weak policy: that one errs does not make it likelier that nothing is wrong with the set-up.
+    """
     likely = {
-        each.name: max(other.evidence.likelihood for other in findings if other is each or each.explains(other))
+        each.name: max(
+            other.evidence.likelihood
+            for other in findings
+            if other is each or (each.explains(other) and not each.cause.weak)
+        )
         for each in findings
     }
     rest = sorted(findings, key=lambda each: (-likely[each.name], each.name))

@@ -78,9 +78,9 @@ def resized(picture: NDArray[np.generic], size: tuple[int, int]) -> NDArray[np.f
 
 
 def reddened(picture: NDArray[np.uint8], weights: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """The picture in grey, with red where the weights, shape (h, w), are large."""
+    """The picture in grey, with red where the weights, shape (h, w), exceed the smallest one; none if all are equal."""
     height, width = picture.shape[:2]
-    scaled = (255 * weights / max(float(weights.max()), 1e-12)).astype(np.uint8)
+    scaled = (255 * (weights - weights.min()) / max(float(weights.max()), 1e-12)).astype(np.uint8)
     mask = np.asarray(Image.fromarray(scaled).resize((width, height), Image.Resampling.BILINEAR), np.float32) / 255
     shown = np.repeat(grey(picture)[..., None], 3, axis=2) * (1 - 0.6 * mask[..., None])
     shown[..., 0] += 0.6 * 255 * mask

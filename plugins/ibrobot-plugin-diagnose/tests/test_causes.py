@@ -14,6 +14,7 @@ import pytest
 from ibrobot_diagnose.card import make_card
 from ibrobot_diagnose.cause import KIND, Cause, CauseDescriptor, Evidence, Reference
 from ibrobot_diagnose.causes.data import UnseenStates
+from ibrobot_diagnose.causes.motion import AnswersTremble
 from ibrobot_diagnose.diagnosis import diagnose, installed_causes
 from ibrobot_diagnose.report import Explanation
 from made_runs import Run, window_of
@@ -214,6 +215,26 @@ def test_answers_of_noise_are_a_weak_policy(data):
     assert diagnosis.first == "answers_tremble"
     explained = Explanation.of(run, data, diagnosis)
     assert explained.first.startswith("Nothing is wrong with the set-up; more or better data is what helps: ")
+
+
+def test_weak_policy_is_no_excuse_for_a_likelier_fault(data):
+    """What noise brings about, too, makes it no likelier than a shifted zero."""
+
+    class Trembles(AnswersTremble):
+        def test(self, window, reference):
+            return Evidence("They tremble.", 40.0, "%", 50.0, 0.6)
+
+    class Off(Squeaks):
+        name, likely = "arm_not_following", 1.0
+
+        def test(self, window, reference):
+            return Evidence("It squeaks.", 1.0, "joints", 0.5, self.likely)
+
+    class Zero(Off):
+        name, likely = "joint_zero", 0.9
+
+    named = diagnose(window_of(Run(cameras=())), data, [Trembles(), Off(), Zero()]).findings
+    assert [each.name for each in named] == ["joint_zero", "answers_tremble", "arm_not_following"]
 
 
 def riding(data):

@@ -7,7 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ibrobot_provenance.reports import PLOT_CLASSES, Case, Cases, Plots, ReportDescriptor, ReportSection, Table, Text
+from ibrobot_provenance.reports import (
+    PLOT_CLASSES,
+    Case,
+    Cases,
+    Fix,
+    Plots,
+    ReportDescriptor,
+    ReportSection,
+    Table,
+    Text,
+)
 from ibrobot_web.ui import recordings, reports
 from ui_server import UiServer, run_ui
 
@@ -22,9 +32,9 @@ def taste(folder: Path) -> list[ReportSection]:
     if "spilt" in (folder / FILE).read_text():
         raise IbrobotError(f"{folder / FILE}: is spilt")
     cases = [
-        Case("cup 1", "cold", folder / "one", folder / "one.mp4", "brew --cup 1"),
+        Case("cup 1", "cold", folder / "one", folder / "one.mp4", "brew --cup 1", 1.5, (Fix("Drop", "delete"),)),
         Case("cup 2", "gone", folder / "two", folder / "link.mp4"),
-        Case("cup 3", "never filled", None),
+        Case("cup 3", "never filled", folder / "set:2"),
     ]
     table = Table(("cup", "taste"), (("1", "nut"),))
     return [ReportSection("Tasting", (Text("fine", "verdict"), table, Plots(("<svg/>",)), Cases(tuple(cases))))]
@@ -48,6 +58,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (opened / name).mkdir(parents=True)
         (opened / name / FILE).write_text("spilt" if name == "bad" else "fine")
     (opened / "good/one").mkdir()
+    (opened / "good/set").mkdir()
     (opened / "good/one.mp4").write_bytes(bytes(range(100)))
     (tmp_path / "secret.mp4").write_bytes(b"secret")
     (opened / "good/link.mp4").symlink_to(tmp_path / "secret.mp4")
@@ -70,9 +81,19 @@ def test_reports_are_listed_and_shown(folder: Path) -> None:
                 "command": "brew --cup 1",
                 "episode": "good/one",
                 "video": "good/one.mp4",
+                "at_s": 1.5,
+                "fixes": [{"label": "Drop", "does": "delete", "outcome": "", "begin_s": 0.0, "end_s": 0.0}],
             },
-            {"title": "cup 2", "text": "gone", "command": "", "episode": "", "video": ""},
-            {"title": "cup 3", "text": "never filled", "command": "", "episode": "", "video": ""},
+            {"title": "cup 2", "text": "gone", "command": "", "episode": "", "video": "", "at_s": 0.0, "fixes": []},
+            {
+                "title": "cup 3",
+                "text": "never filled",
+                "command": "",
+                "episode": "good/set:2",
+                "video": "",
+                "at_s": 0.0,
+                "fixes": [],
+            },
         ]
 
     run_ui([folder], test)
@@ -110,3 +131,5 @@ def test_browsers_may_ask_for_parts_of_a_video(folder: Path) -> None:
 def test_page_colours_all_classes_of_plots() -> None:
     style = (STATIC / "ui/recordings.css").read_text(encoding="utf-8")
     assert set(re.findall(r"\.plotted \.([\w-]+) \{", style)) == set(PLOT_CLASSES)
+    for stroke in ("range", "estimate", "margin", "bad"):  # the page takes shapes without their attribute `fill`
+        assert re.search(rf"\.plotted \.{stroke} \{{[^}}]*fill: none;", style), stroke
