@@ -204,7 +204,8 @@ def trials(arguments: argparse.Namespace) -> Iterator[Trial]:
         place = (2, 0, 1)[number % 3]
         for row, (name, fault) in enumerate(FAULTS.items()):
             policy = fault.policy or f"early-{fault.strengths[place]}"
-            if policy in arguments.policies and (not arguments.only or name in arguments.only):
+            chosen = STRENGTHS[place] in arguments.strengths and (not arguments.only or name in arguments.only)
+            if policy in arguments.policies and chosen:
                 yield Trial(name, STRENGTHS[place], policy, fault.strengths[place], first + 100 * number + row)
         policies = [each for each in HEALTHY if each in arguments.policies]
         for healthy in range(number, arguments.healthy, 3 * arguments.trials):

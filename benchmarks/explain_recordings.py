@@ -14,8 +14,9 @@ import argparse
 import json
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -28,10 +29,14 @@ from ibrobot_diagnose.cause import Reference
 from ibrobot_diagnose.causes import others
 from ibrobot_diagnose.diagnosis import diagnose, installed_causes
 from ibrobot_diagnose.references import find_episodes, read_episode
-from ibrobot_diagnose.window import Window
+from ibrobot_diagnose.window import Camera, Window
 from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 
+from ibrobot_core.api import Image as ImageMessage
+
+EVERY = 3
+"""Of so many pictures one is looked at."""
 STRENGTHS = ("mild", "medium", "strong")
 type Pixels = NDArray[np.uint8]
 
@@ -105,51 +110,60 @@ def cameras(window: Window) -> Iterator[tuple[str, str, Window]]:
         yield from (("cameras_exchanged", strength, exchanged) for strength in STRENGTHS)
 
 
-def pictures(episode: Path) -> Iterator[tuple[str, str, Window]]:
+def read(episode: Path) -> tuple[Window, list[tuple[str, int, Any]]]:
+    """An episode with every `EVERY`th picture, and these: topic, time [ns] and message."""
+    take, counts = windows._Reading._take_picture, Counter[str]()
+    kept: list[tuple[str, int, Any]] = []
+
+    def some(self: Any, camera: Camera, message: Any, t_ns: int) -> None:
+        if counts[camera.topic] % EVERY == 0:
+            kept.append((camera.topic, t_ns, message))
+            take(self, camera, message, t_ns)
+        counts[camera.topic] += 1
+
+    with patch.object(windows._Reading, "_take_picture", some):
+        return read_episode(episode), kept
+
+
+def pictures(window: Window, kept: Sequence[tuple[str, int, Any]]) -> Iterator[tuple[str, str, Window]]:
     """As `positions`, of what the first camera sees."""
-    plain, contract = windows._rgb, read_episode(episode).contract
-    first = next((part.topic for part in contract.observation_parts if part.image is not None), "")
-    if not first:
+    if not window.cameras:
         return
-    take = windows._Reading._take_picture
+    key, seen = next(iter(window.cameras.items()))
+    every = SimpleNamespace(_keep_every_ns=int(1e9 * window.seconds / windows.KEPT), _still_every_ns=int(1e9))
     for name, (change, arguments) in SEEN.items():
         for strength, argument in zip(STRENGTHS, arguments, strict=True):
-            changed = [False]
-
-            def taken(self: Any, camera: Any, message: Any, t_ns: int, now: list[bool] = changed) -> None:
-                now[0] = camera.topic == first
-                take(self, camera, message, t_ns)
-
-            def rgb(message: Any, now: list[bool] = changed, change: Any = change, argument: Any = argument) -> Pixels:
-                shown = plain(message)
-                return np.asarray(change(shown, argument) if now[0] else shown, np.uint8)
-
-            with patch.object(windows._Reading, "_take_picture", taken), patch.object(windows, "_rgb", rgb):
-                window = read_episode(episode)
-            yield name, strength, window
+            camera = Camera(key, seen.topic)
+            for topic, t_ns, message in kept:
+                if topic == seen.topic:
+                    shown = np.asarray(change(windows._rgb(message), argument), np.uint8)
+                    changed = ImageMessage(message.header, *shown.shape[:2], "rgb8", 3 * shown.shape[1], shown.ravel())
+                    windows._Reading._take_picture(every, camera, changed, t_ns)  # type: ignore[arg-type]
+            yield name, strength, attrs.evolve(window, cameras={**window.cameras, key: camera})
 
 
 def trials(episode: Path) -> Iterator[tuple[str, str, Window]]:
     """Cause, strength and episode with that fault; the episode as it is first."""
-    window = read_episode(episode)
+    window, kept = read(episode)
     yield "", "", window
     yield from positions(window)
     yield from cameras(window)
-    yield from pictures(episode)
+    yield from pictures(window, kept)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dataset", type=Path, help="a LeRobot dataset, or a folder of recorded episodes")
     parser.add_argument("--episodes", type=int, default=6, help="episodes over which faults are laid")
+    parser.add_argument("--of", type=int, help="episodes of the dataset that are used; by default all")
     parser.add_argument("--work", type=Path, default=Path("explain_recordings"), help="folder of the card")
     arguments = parser.parse_args()
-    episodes = find_episodes([arguments.dataset])
+    episodes = find_episodes([arguments.dataset])[: arguments.of]
     kept, held = episodes[: -arguments.episodes], episodes[-arguments.episodes :]
     file = arguments.work / "reference.json"
     if not file.exists():
         arguments.work.mkdir(parents=True, exist_ok=True)
-        make_card(map(read_episode, kept)).write(file)
+        make_card(read(each)[0] for each in kept).write(file)
     reference = Reference(Card.read(file))
     causes = [each for each in installed_causes() if type(each) not in others.TOOLS and each.name != "not_judged"]
     right, all_of, accused = Counter[tuple[str, str]](), Counter[tuple[str, str]](), Counter[str]()

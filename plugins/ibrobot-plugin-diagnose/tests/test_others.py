@@ -102,5 +102,10 @@ def test_tools_that_are_not_installed_are_no_causes(monkeypatch):
 def test_the_real_tools_take_an_episode(tool):
     pytest.importorskip(tool, reason="needs lerobot-doctor and lerobot-lint")
     others._checks_of_lint.cache_clear()
-    frozen = attrs.evolve(DEMO, command=attrs.evolve(DEMO.command, values=np.zeros_like(DEMO.command.values)))
+    state, command = (each.values.copy() for each in (DEMO.state, DEMO.command))
+    state[:, 3] = command[:, 3] = 0.2  # a joint that never moves
+    command[: len(command) // 2] = command[0]  # and commands that stay the same for half of the time
+    frozen = attrs.evolve(
+        DEMO, state=attrs.evolve(DEMO.state, values=state), command=attrs.evolve(DEMO.command, values=command)
+    )
     assert diagnose(frozen, Reference(), [TOOLS[tool]()]).first == tool

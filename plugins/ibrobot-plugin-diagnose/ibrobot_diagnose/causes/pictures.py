@@ -362,6 +362,8 @@ class PictureCovered(PictureCause):
 
 
 def _agree(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
+    if min(one.std(), other.std()) < 1e-6:
+        return 0.0  # one of them is the same everywhere
     return float(np.corrcoef(one, other)[0, 1])
 
 
