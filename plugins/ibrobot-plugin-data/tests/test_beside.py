@@ -6,6 +6,7 @@ import json
 import logging
 import random
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -367,7 +368,7 @@ def test_the_end_of_a_session_does_not_wait_for_a_starved_process(monkeypatch: p
     monkeypatch.setattr(beside, "Child", Process)
     monkeypatch.setattr(Process, "made", [])
     times = iter(range(100))
-    monkeypatch.setattr(beside.time, "monotonic", lambda: float(next(times)))
+    monkeypatch.setattr(time, "monotonic", lambda: float(next(times)))
     first = WrittenEpisode(Path("episode_000001"), "success", "success", whole=True)
     service: Any = SimpleNamespace(written=[first], replaced=None, running=False, writing=False)
     options = Convert(episodes=(Path("kept"),), out=Path("set"), append=True)

@@ -109,9 +109,9 @@ def test_of_a_flood_of_goals_the_newest_is_planned_and_a_cancel_waits_for_none(
 ):
     runtime, planned, plan = run(by_operator=True), [0], GoalPlans.plan
 
-    def counted(self: GoalPlans, *arguments: Any) -> Any:
+    def counted(self: GoalPlans, *arguments: Any, **options: Any) -> Any:
         planned[0] += 1
-        return plan(self, *arguments)
+        return plan(self, *arguments, **options)
 
     monkeypatch.setattr(GoalPlans, "plan", counted)
     call = runtime.session.bus.call

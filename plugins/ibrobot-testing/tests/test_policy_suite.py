@@ -58,7 +58,7 @@ class TestPolicy(PolicySuite):
             state = np.linspace(-0.4, 0.6, 6, dtype=np.float32)
             picture = np.zeros((4, 4, 3), np.uint8)
             picture[..., 0] = red
-            values = {"observation.state": state, "observation.images.top": picture}
+            values: dict[str, Any] = {"observation.state": state, "observation.images.top": picture}
             yield Frame(ctx.clock.now_ns(), values), state + shares * (goal + 0.5 * red / 255 - state)
 
 
