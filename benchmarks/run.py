@@ -112,9 +112,9 @@ CLAIMS = (
     ),
     Claim(
         "record_convert",
-        "`ibrobot record --convert` loses no message, misses no tick, and gives the bytes of a later conversion",
+        "`ibrobot record --convert` loses no message, misses no more ticks, and gives the bytes of a later conversion",
         "docs/how-to/record.md",
-        "record_convert.py --episodes 3 --seconds 5 --pause 2",
+        "record_convert.py",
     ),
     Claim(
         "scenes",
