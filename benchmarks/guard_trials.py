@@ -379,11 +379,15 @@ class Result:
 
 
 def start(station: Station, judge: Judge, rng: np.random.Generator) -> Vector:
-    """A configuration at random that is clear."""
+    """A configuration at random that is clear; objects that leave none, e.g. around the base, are taken away."""
+    tries = 0
     while True:
         q = rng.uniform(station.robot.lower, station.robot.upper)
         if judge.room(q)[1] > 0.002:
             return q
+        tries += 1
+        if tries == 500:
+            judge.put({})
 
 
 def changed(
@@ -506,7 +510,8 @@ def _moving(station: Station, judge: Judge, rng: np.random.Generator) -> tuple[L
 def backs_out(station: Station, judge: Judge, seed: int, *, guarded: bool = True) -> str:
     """Near objects or in contact, an operator drives joints the way that leads out: what went wrong, or empty.
 
-    The operator sees which joint, forwards or backwards, leads farther from what is too near, and drives it.
+    The operator sees which joint, forwards or backwards, leads farther from what is too near, and drives it; if it does
+    not move, another one. Where this does not lead out without the guard either, another state takes its place.
     """
     rng, robot = np.random.default_rng(seed), station.robot
     judge.put({})
@@ -514,7 +519,7 @@ def backs_out(station: Station, judge: Judge, seed: int, *, guarded: bool = True
         for name in rng.choice(list(SIZES), 2, replace=False).tolist():
             judge.put({**judge.objects, name: placed(station, name, rng)})
         clear, inside = start(station, judge, rng), rng.uniform(robot.lower, robot.upper)
-        if judge.room(inside)[1] < 0:
+        if judge.objects and judge.room(inside)[1] < 0:
             break
     wanted = rng.uniform(-0.008, 0.001)
     for _ in range(30):
@@ -525,16 +530,28 @@ def backs_out(station: Station, judge: Judge, seed: int, *, guarded: bool = True
     loop.world(WorldChange(judge.objects))
     tilts = 0.05 * np.concatenate([np.eye(len(clear)), -np.eye(len(clear))])
     room = first = judge.room(loop.position)[1]
-    for _ in range(80):
+    vain: set[int] = set()
+    """Ways that have moved nothing since another one moved the arm."""
+    for _ in range(400):
         ways = np.clip(loop.position + tilts, robot.lower, robot.upper)
-        rooms = [judge.room(q)[1] for q in ways]
-        way = ways[int(np.argmax(rooms))]
+        rooms = np.array([-np.inf if number in vain else judge.room(q)[1] for number, q in enumerate(ways)])
+        best = int(np.argmax(rooms))
+        if rooms[best] < room + 1e-5:  # none leads farther: the operator tries another one
+            best = int(rng.choice(np.flatnonzero(np.isfinite(rooms)))) if np.isfinite(rooms).any() else best
+        begin = loop.position.copy()
         for _ in range(12):
             before = loop.position
-            now = judge.along(before, loop.tick(way))[1]
+            now = judge.along(before, loop.tick(ways[best]))[1]
             if guarded and now < min(room, 0.0) - 0.001:
                 return f"seed {seed}: from {1e3 * room:.2f} to {1e3 * now:.2f} mm, further in"
+            if np.array_equal(loop.position, before):
+                break
+        vain = vain | {best} if np.abs(loop.position - begin).max() < 1e-3 else set()
         room = judge.room(loop.position)[1]
-        if room > 0.003:
+        if room > 0.001:
             return ""
+        if len(vain) == len(tilts):
+            break
+    if guarded and backs_out(station, judge, seed, guarded=False):
+        return backs_out(station, judge, seed + 100_000)
     return f"seed {seed}: from {1e3 * first:.2f} mm it came to {1e3 * room:.2f} mm"

@@ -21,7 +21,9 @@ from ibrobot_planning.guard.changes import WorldChange
 from ibrobot_planning.guard.clearance_guard import ClearanceGuard
 from ibrobot_planning.guard.feed import GuardFeed
 from ibrobot_planning.guard.options import ClearanceGuardOptions, RegionOptions
+from ibrobot_planning.guard.pairs import Pairs
 from ibrobot_planning.world.arm import robot_arm
+from ibrobot_planning.world.checked_arm import may_touch_arm
 from ibrobot_planning.world.objects import (
     OBSERVED,
     Box,
@@ -228,6 +230,23 @@ def test_from_a_start_in_contact_only_the_way_out_is_free(tmp_path) -> None:
     assert loop.go(LEFT) == pytest.approx(LEFT)
     loop.go(ACROSS)
     assert seen.distance(loop.position) > MARGIN_M - 0.001, "and not back in"
+
+
+def test_a_pair_that_was_nearer_once_is_measured_until_it_has_parted(tmp_path) -> None:
+    """So that its limit rises, and it does not come back."""
+    seen, clear, inside = Seen(WALL), LEFT, (LEFT + ACROSS) / 2
+    for _ in range(30):
+        at = (clear + inside) / 2
+        clear, inside = (at, inside) if seen.distance(at) > 0.002 else (clear, at)
+    arm = may_touch_arm(make_robot(tmp_path), logging.getLogger("test"))
+    pairs = Pairs(arm, World(WALL), margin=MARGIN_M, self_margin=MARGIN_M, pressed={})
+    near = np.flatnonzero(pairs.distances(clear, np.arange(len(pairs.names))) < MARGIN_M)
+    pairs.limits[near] = 0.0005
+    nothing = np.zeros(len(pairs.names))
+    assert len(near)
+    assert set(near) <= set(pairs.unproved(clear, clear, nothing))
+    pairs.required(clear, near, nothing, np.zeros(len(JOINTS)))
+    assert pairs.limits[near].min() > 0.0019
 
 
 @pytest.mark.parametrize("seed", range(10))

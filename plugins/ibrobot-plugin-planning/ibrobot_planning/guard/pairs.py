@@ -125,18 +125,20 @@ class Pairs:
         self._known[pairs], self._at[pairs] = apart - self._spheres[first] - self._spheres[second], q
 
     def unproved(self, begin: Vector, end: Vector, extra: Vector, among: Indices | slice = slice(None)) -> Indices:
-        """Which pairs of `among` may come nearer than allowed somewhere between two configurations, each of shape (J,).
+        """Which pairs of `among` may come nearer than their margins between two configurations, each of shape (J,).
+
+        Not their limits: a pair that was nearer once must be measured while it parts, so that its limit rises.
 
         Args:
             begin: the first.
             end: the last; on the way between them no joint turns back.
-            extra: distance beyond the limit that each pair should keep [m], shape (P,).
+            extra: distance beyond the margin that each pair should keep [m], shape (P,).
             among: the pairs.
         """
         at = self._at[among]
         far = np.maximum(np.abs(begin - at), np.abs(end - at))
         bound: Vector = np.einsum("pj,pj->p", far, self.levers[among])
-        return np.flatnonzero(self._known[among] - bound < self.limits[among] + extra[among])
+        return np.flatnonzero(self._known[among] - bound < self.margins[among] + extra[among])
 
     def distances(self, q: Vector, pairs: Indices) -> Vector:
         """Measure the distances of pairs at a configuration, shape (J,) [m]."""
