@@ -75,6 +75,12 @@ def test_a_label_of_another_guard_is_shown_as_it_is(label):
     assert f"between {label}." in first.evidence.text
 
 
+def test_a_guard_that_said_nothing_is_no_cause() -> None:
+    window = window_of(Run(seed=9200, cameras=(), guarded=(0.2, 0.8)))
+    report = diagnose(attrs.evolve(window, guarded=()), Reference())
+    assert "guard_held" not in {each.name for each in report.findings}
+
+
 @pytest.mark.parametrize("outcome", ["success", "failure"])
 def test_healthy_runs_accuse_nobody_with_the_data(outcome, data):
     runs = [Run(seed=seed, drift=0.01, outcome=outcome, **BOTH) for seed in range(9200, 9203)]

@@ -81,15 +81,15 @@ class GuardHeld(Cause):
     explains = frozenset({"arm_not_following", "limits_low", "stands_still"})
     remedy = (
         "Move what is in the way, or correct its place and size in the section `world`. If the arm is meant to touch "
-        "it, say so: `may_touch` of the object, or `may_touch` and `free` of `control.guard`."
+        "it, say so: `movable` or `may_touch` of the object, or `may_touch`, `free` and `regions` of `control.guard`."
     )
 
     @override
     def test(self, window: Window, reference: Reference) -> Evidence | None:
         end_ns = int(window.ticks_ns[-1]) if len(window.ticks_ns) else 0
         held: dict[str, int] = {}
-        begins = [since for since, _ in window.guarded[1:]] + [end_ns]
-        for (since, label), until in zip(window.guarded, begins, strict=True):
+        begins = [*(since for since, _ in window.guarded), end_ns]
+        for (since, label), until in zip(window.guarded, begins[1:], strict=True):
             if label:
                 pair = _pair(label)
                 held[pair] = held.get(pair, 0) + max(0, until - since)
