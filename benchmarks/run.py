@@ -201,6 +201,12 @@ CLAIMS = (
         "moving_fleet.py --faults",
     ),
     Claim(
+        "agents_door",
+        "an agent that floods the run with plans makes control miss no tick, and its stop is latched within 100 ms",
+        "docs/decisions/0064-agents-have-authority-from-persons.md",
+        "agents_door.py",
+    ),
+    Claim(
         "explain",
         "`ibrobot explain` names most strong faults that are planted in simulated runs first, and seldom accuses a"
         " healthy run or a weak policy's set-up",
