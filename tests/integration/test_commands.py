@@ -252,6 +252,7 @@ JSON = {
     "plugins new teleop my_stick --out new --json": 0,
     "doctor --json": None,
     "agent list --json": 0,
+    "agent add scout --json": 0,
     "agent status --json": 2,
     "camera list --json": 0,
     "camera calibrate BAD --json": 2,

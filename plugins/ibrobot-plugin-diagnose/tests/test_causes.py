@@ -66,6 +66,12 @@ def test_healthy_runs_accuse_nobody():
     assert Counter(first_of(run, Reference()) for run in runs) == {"": 25}
 
 
+def test_a_guard_that_held_nothing_back_is_healthy():
+    window = attrs.evolve(window_of(Run(seed=9201, cameras=(), guarded=(0.2, 0.8))), guarded=())
+    assert "guard" in window.streams
+    assert "guard_held" in {name for name, _ in diagnose(window, Reference()).healthy}
+
+
 @pytest.mark.parametrize("label", ["no JSON", "[]", "{}", "3", '{"first": 1}'])
 def test_a_label_of_another_guard_is_shown_as_it_is(label):
     window = window_of(Run(seed=9200, cameras=(), guarded=(0.2, 0.8)))
