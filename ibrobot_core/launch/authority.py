@@ -190,9 +190,6 @@ class Authority:
         if session.faults:
             raise HardwareError(f"{ARM.name}: refused before a reset: {session.faults[-1]}")
         with session.changing:
-            self.end("another grant replaces it")
-            if session.held:
-                session.bus.call("/set_mode", session.mode)
             numbers = joint_selection(session.config.robot, tuple(grant.region)) if grant.region else None
             for path, bounds in grant.region.items():
                 if (size := joint_selection(session.config.robot, (path,)).size) != len(bounds):
@@ -200,7 +197,14 @@ class Authority:
             scope = Scope(chosen[0], grant, session.clock.now_ns() + ns(grant.seconds), numbers)
             if outside := self._outside(scope):
                 raise HardwareError(f"{ARM.name}: the robot is not in the region: {outside}; drive it there first")
-            session.control.call(LimitSpeed(grant.speed))
+            self.end("another grant replaces it")
+            session.control.call(LimitSpeed(grant.speed))  # before the mode goes on, which may be that of a policy
+            try:
+                if session.held:
+                    session.bus.call("/set_mode", session.mode)
+            except BaseException:
+                session.control.call(LimitSpeed(self.speed))
+                raise
             self.renew(scope.agent)
             self._called, self._left, self.speed, self._scope = {}, "", grant.speed, scope
         self._note("armed", scope.agent, kept=True, grant=attrs.asdict(grant))

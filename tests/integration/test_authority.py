@@ -15,6 +15,7 @@ import pytest
 from ibrobot_core.api import Header, JointState, MoveJoint
 from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
 from ibrobot_core.contract.specs import joint_selection
+from ibrobot_core.control.commands import LimitSpeed
 from ibrobot_core.errors import ContractError, HardwareError, IbrobotError, NotSupported, RequestError, TransportError
 from ibrobot_core.launch.authority import AGENT_LOG, ARM, DISARM, STATUS, Agent, Grant
 
@@ -378,6 +379,65 @@ def test_policy_that_leaves_the_region_holds_within_it() -> None:
     assert "not within the region: shoulder_lift.pos would be" in run.session.bus.call(STATUS).ended
     assert np.array(run.commands)[:, 1].max() <= -1.199
     run.close()
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"region": {"tool.nothing": ((0.0, 1.0),)}},
+        {"region": {"tool.position": ((0.0, 1.0),)}},
+        {"region": {"tool.position": ((0.9, 1.0),) * 3}},
+        {"agent": "2:nobody"},
+    ],
+)
+def test_policy_that_holds_does_not_go_on_by_a_grant_that_is_refused(more: Any) -> None:
+    run = AgentRun(scene="pick_cube")
+    policy(run)
+    run.ticks(100)
+    run.session.bus.call(DISARM)
+    run.ticks(100)
+    with pytest.raises(IbrobotError):
+        run.grant(**more)
+    assert run.moved(150) == 0.0
+    assert run.session.held
+    run.close()
+
+
+def test_policy_goes_on_when_its_speed_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    run = AgentRun(scene="pick_cube")
+    policy(run)
+    run.ticks(100)
+    run.session.bus.call(DISARM)
+    run.ticks(100)
+    limited: list[bool] = []
+    call = run.session.control.call
+
+    def note(command: Any, *more: Any) -> Any:
+        if isinstance(command, LimitSpeed):
+            limited.append(run.session.held)
+        return call(command, *more)
+
+    monkeypatch.setattr(run.session.control, "call", note)
+    run.grant(speed=0.1)
+    assert limited == [True]
+    assert run.moved(150) > 0.05
+    run.close()
+
+
+def test_mode_that_does_not_go_on_leaves_no_speed_limit(run: AgentRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    run.grant(seconds=0.3)
+    run.ticks(50)
+    with monkeypatch.context() as patch:
+        patch.setattr(run.runtime, "_go_on", lambda: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            run.grant(speed=0.1)
+    assert run.session.bus.call(STATUS).armed == ""
+    run.session.bus.call("/set_mode", "moveit_planning")
+    run.session.bus.call(GO_TO, AWAY)
+    begun = len(run.commands)
+    run.ticks(200)
+    speeds = np.abs(np.diff(run.commands[begun:], axis=0)).max(axis=0) * 100.0
+    assert (speeds / run.session.config.robot.max_velocity).max() > 0.5
 
 
 def test_goal_out_of_the_region_moves_nothing(run: AgentRun) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import getpass
-from collections.abc import Mapping
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ import attrs
 
 from ibrobot_core.api import IbrobotError, option
 from ibrobot_core.app import Grant, RequestError, confirm, echo
-from ibrobot_mcp.persons import ask, running
+from ibrobot_mcp.persons import ask, running, sockets_folder
 from ibrobot_mcp.tokens import add_token, named_agents, remove_token
 
 MOVING = attrs.fields(Grant).services.default or ()
@@ -29,7 +31,11 @@ class _OfRun:
         """
         sockets = [path for path in running() if self.robot in ("", path.stem)]
         if not sockets:
-            raise RequestError("no robot with a door for agents runs here: start one by `ibrobot mcp`")
+            named = f" named {self.robot}" if self.robot else ""
+            raise RequestError(
+                f"no robot{named} with a door for agents runs here: start one by `ibrobot mcp`; each run of yours has "
+                f"a socket in {sockets_folder()}, or where its XDG_RUNTIME_DIR says"
+            )
         if len(sockets) > 1:
             raise RequestError(f"several run here, name one: {', '.join(path.stem for path in sockets)}")
         return sockets[0]
@@ -57,15 +63,29 @@ class ArmAgent(_OfRun):
     def __call__(self) -> None:
         path = self.path()
         services = list(self.allow or MOVING)
+        region = list(map(_bounds, self.region))
+        if twice := [name for name, count in Counter(name for name, _ in region).items() if count > 1]:
+            raise RequestError(f"--region {twice[0]}: it is given twice")
+        agent = self._chosen(ask(path, "/agent/status")["agents"])
         grant = {
             "seconds": self.seconds, "services": services, "speed": self.speed, "lease": self.lease,
-            "agent": self.agent, "region": dict(map(_bounds, self.region)), "by": getpass.getuser(),
+            "agent": agent, "region": dict(region), "by": _user(),
         }  # fmt: skip
-        echo(f"{path.stem}: for {self.seconds:g} s, {self.speed:.0%} of the speed limits, {', '.join(services)}")
+        echo(f"{agent} on {path.stem}: for {self.seconds:g} s, {self.speed:.0%} of the speed limits")
+        echo(f"services: {', '.join(services)}")
         echo(f"region: {', '.join(self.region) or 'no limits but those of the joints'}")
         if not self.yes and not confirm("Let the agent move the robot?", flag="--yes"):
             raise IbrobotError("nothing was granted")
         echo(ask(path, "/agent/arm", grant))
+
+    def _chosen(self, connected: Sequence[str]) -> str:
+        """The name of the agent in this connection, so that no other one gets the grant that the person agrees to."""
+        chosen = [each for each in connected if self.agent in ("", each, each.partition(":")[2])]
+        if not connected:
+            raise RequestError("no agent is connected: start its program, and have it call a tool, e.g. `state`")
+        if len(chosen) != 1:
+            raise RequestError(f"name one agent by --agent; connected: {', '.join(connected)}")
+        return chosen[0]
 
 
 @attrs.frozen(kw_only=True)
@@ -133,6 +153,14 @@ class ShowAgents(_OfRun):
             echo(f"{status['armed']}: {status['left_s']:.0f} s left at {grant['speed']:.0%}, {services}")
         elif status["ended"]:
             echo(f"the last authority ended: {status['ended']}")
+
+
+def _user() -> str:
+    """Who grants it, for the log. In containers, the number of a user often has no name."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):
+        return str(os.getuid())
 
 
 def _bounds(text: str) -> tuple[str, list[list[float]]]:

@@ -17,6 +17,7 @@ from ibrobot_mcp.options import McpOptions
 from ibrobot_mcp.persons import Persons
 from ibrobot_mcp.server import PIPES, AgentServer
 from ibrobot_mcp.stdio import Pipes, serve_pipes
+from ibrobot_mcp.tokens import tokens_folder
 from ibrobot_mcp.web import http_server
 
 _CHECK_S = 0.02
@@ -70,6 +71,7 @@ class AgentDoor(SessionWorker):
         """Serve agents until the block ends."""
         async with contextlib.AsyncExitStack() as stack:
             if self._options.http:
+                tokens_folder()  # a folder that others may enter is said now: later, nobody has a token
                 options = self._options
                 tls = None
                 if options.certificate is not None and options.key is not None:
@@ -134,7 +136,7 @@ class _ServerThread:
             async with door.serving(server):
                 session.pulses.add(self._pulse)
                 self._started.set()
-                work = (server.ping(), self._beat(), door.serve_pipes(server))
+                work = (server.ping(), server.check_tokens(), self._beat(), door.serve_pipes(server))
                 tasks = [asyncio.create_task(each) for each in work]
                 ending = asyncio.create_task(self._ending.wait())
                 await _first_failure(ending, tasks)

@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import socket
-import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,15 +22,25 @@ _LARGEST = 64 * 1024
 _TIMEOUT_S = 10.0
 
 
+_RUNTIMES = Path("/run/user")
+"""Where systemd makes the folder of a user's session, to which it sets XDG_RUNTIME_DIR."""
+_WITHOUT = Path("/tmp")
+"""For the sockets where there is no such folder. Not $TMPDIR, which programs of agents do not pass on, either."""
+
+
 def sockets_folder() -> Path:
     """The folder of the sockets, which only this user may enter.
+
+    It is the same for `ibrobot mcp` and for the person's terminal, although most agents' programs start the former with
+    few variables of the environment, without XDG_RUNTIME_DIR.
 
     Raises:
         IbrobotError: if another user owns it, or it is a link, which another user may have made.
     """
-    runtime = os.environ.get("XDG_RUNTIME_DIR")
-    folder = Path(runtime) / "ibrobot" if runtime else Path(tempfile.gettempdir()) / f"ibrobot-{os.getuid()}"
-    return own_folder(folder, "XDG_RUNTIME_DIR")
+    user = os.getuid()
+    usual = _RUNTIMES / str(user)
+    runtime = os.environ.get("XDG_RUNTIME_DIR") or (str(usual) if usual.is_dir() else "")
+    return own_folder(Path(runtime) / "ibrobot" if runtime else _WITHOUT / f"ibrobot-{user}", "XDG_RUNTIME_DIR")
 
 
 class Persons:

@@ -147,19 +147,24 @@ class AgentServer:
         """
         while True:
             await asyncio.sleep(_PING_S)
-            for key, client in tuple(self._clients.items()):
-                if client.name and not await self._in_thread(agent_of, client.token):
-                    await self.leave(key)
             if self._authority.status().armed:
                 await asyncio.gather(*(self._ping(each) for each in tuple(self._clients.values())))
 
     async def _ping(self, client: Client) -> None:
         if client.session is None:
             return
-        with suppress(MCPError, anyio.ClosedResourceError, anyio.BrokenResourceError, TimeoutError):
+        with suppress(Exception):  # an agent answers what it likes; what is no answer is no sign of life
             async with asyncio.timeout(_PONG_S):
                 await client.session.send_ping()
             self._authority.renew(client.agent)
+
+    async def check_tokens(self) -> None:
+        """Disconnect the clients whose token is taken away, until it is cancelled; no ping holds it up."""
+        while True:
+            await asyncio.sleep(_PING_S)
+            for key, client in tuple(self._clients.items()):
+                if client.name and not await self._in_thread(agent_of, client.token):
+                    await self.leave(key)
 
     async def leave(self, key: str) -> None:
         """Disconnect a client, whose authority ends."""

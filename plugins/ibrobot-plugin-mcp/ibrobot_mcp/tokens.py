@@ -86,13 +86,13 @@ def named_agents() -> list[str]:
 
 
 def agent_of(token: str) -> str:
-    """The name of the agent that has a token; empty if none has it."""
+    """The name of the agent that has a token; empty if none has it, or the folder is not this user's alone."""
     name = token.partition(".")[0]
     if len(token) > _LONGEST or not _NAME.fullmatch(name):
         return ""
     try:
         kept = (tokens_folder() / name).read_bytes()[:_LONGEST]
-    except OSError:
+    except (OSError, IbrobotError):  # or others may enter the folder
         return ""
     return name if hmac.compare_digest(kept, _hash(token).encode()) else ""
 

@@ -108,9 +108,17 @@ class RobotTool:
         service, moves = self.service, not (self.service.reads or self.service.urgent)
         text = service.help + (" A person must grant it, see `authority`." if moves else "")
         hints = types.ToolAnnotations(read_only_hint=service.reads, destructive_hint=moves, open_world_hint=False)
-        return types.Tool(
-            name=name, description=text, input_schema=OptionSchemas().of_class(service.request), annotations=hints
-        )
+        return types.Tool(name=name, description=text, input_schema=_schema(service.request), annotations=hints)
+
+
+_SCHEMAS: dict[type[Any], dict[str, Any]] = {}
+
+
+def _schema(request: type[Any]) -> dict[str, Any]:
+    """The schema of a request. It is made once: agents may list all tools as often as they like."""
+    if request not in _SCHEMAS:
+        _SCHEMAS[request] = OptionSchemas().of_class(request)
+    return _SCHEMAS[request]
 
 
 class Tools:

@@ -246,6 +246,48 @@ def test_agent_whose_token_is_taken_away_is_disconnected_and_its_authority_ends(
     asyncio.run(talk())
 
 
+def test_token_is_taken_away_though_pings_have_no_answer(door: AgentDoor, token: str) -> None:
+    authority = authority_of(door.session)
+
+    pinged = threading.Event()
+
+    async def never(server: Any, client: Any) -> None:
+        pinged.set()
+        await asyncio.Event().wait()
+
+    async def talk() -> None:
+        async with bearer(token) as http, client(http, door, "legacy") as armed:
+            await armed.list_tools()
+            ask(next(running()), "/agent/arm", {"seconds": 60, "services": ["/test/move"], "lease": 100})
+            await asyncio.to_thread(pinged.wait)
+            remove_token("claude")
+            while authority.status().agents:
+                await asyncio.sleep(0.01)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ibrobot_mcp.server.AgentServer._ping", never)
+        asyncio.run(asyncio.wait_for(talk(), 10))
+
+
+def test_folder_that_others_may_enter_has_no_tokens_and_ends_no_run(door: AgentDoor, token: str, folders: Path) -> None:
+    authority = authority_of(door.session)
+
+    async def talk() -> None:
+        async with bearer(token) as http, client(http, door, "legacy") as agent:
+            await agent.list_tools()
+            (folders / "config" / "ibrobot" / "agents").chmod(0o755)
+            while authority.status().agents:
+                await asyncio.sleep(0.01)
+            assert (await http.post(door.url, json={})).status_code == 401
+
+    asyncio.run(asyncio.wait_for(talk(), 20))
+    assert cast("Session", door.session).failure is None
+    second = AgentDoor(McpOptions(), session_with_control())
+    with pytest.raises(IbrobotError, match="other users may enter it: chmod 700"):
+        second.start()
+    second.stop()
+
+
 def test_agent_has_a_few_connections_and_those_of_others_stay(door: AgentDoor, token: str) -> None:
     other = add_token("hostile")
     authority = authority_of(door.session)
@@ -371,7 +413,7 @@ def test_agent_that_reads_no_answers_is_disconnected_before_they_fill_the_memory
 
 
 def test_person_grants_by_the_command(door: AgentDoor, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(IbrobotError, match="name one agent by `agent`; connected: none"):
+    with pytest.raises(IbrobotError, match="no agent is connected: start its program"):
         ArmAgent(yes=True)()
     agent = authority_of(door.session).join("claude")
     ArmAgent(yes=True, seconds=9)()
@@ -383,6 +425,56 @@ def test_person_grants_by_the_command(door: AgentDoor, capsys: pytest.CaptureFix
     command.show(command())
     assert capsys.readouterr().out == "connected: 1:claude\nthe last authority ended: disarmed\n"
     authority_of(door.session).leave(agent)
+
+
+def test_grant_is_for_the_agent_that_the_person_was_shown(
+    door: AgentDoor, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another one takes its place while the person is asked."""
+    authority = authority_of(door.session)
+    first = authority.join("claude")
+
+    def asked(question: str, *, flag: str) -> bool:
+        assert "1:claude on tester: for 300 s" in capsys.readouterr().out
+        authority.leave(first)
+        authority.join("claude")
+        return True
+
+    monkeypatch.setattr("ibrobot_mcp.commands.confirm", asked)
+    with pytest.raises(IbrobotError, match="name one agent by `agent`; connected: 2:claude"):
+        ArmAgent()()
+    assert authority.status().armed == ""
+
+
+@pytest.mark.parametrize(("named", "armed"), [("claude", "1:claude"), ("1:claude", "1:claude"), ("codex", "2:codex")])
+def test_person_names_an_agent_with_or_without_its_number(door: AgentDoor, named: str, armed: str) -> None:
+    authority = authority_of(door.session)
+    for name in ("claude", "codex", "twin", "twin"):
+        authority.join(name)
+    ArmAgent(yes=True, agent=named)()
+    assert authority.status().armed == armed
+    for unclear in ("", "twin", "nobody"):
+        with pytest.raises(RequestError, match="name one agent by --agent; connected: 1:claude, 2:codex, 3:twin, 4"):
+            ArmAgent(yes=True, agent=unclear)()
+
+
+def test_user_without_a_name_may_grant(door: AgentDoor, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a container that runs as a number."""
+
+    def nameless() -> str:
+        raise KeyError("uid not found")
+
+    monkeypatch.setattr("getpass.getuser", nameless)
+    authority_of(door.session).join("claude")
+    ArmAgent(yes=True)()
+    grant = authority_of(door.session).status().grant
+    assert grant is not None
+    assert grant.by == str(os.getuid())
+
+
+def test_region_that_is_given_twice_is_refused(door: AgentDoor) -> None:
+    with pytest.raises(RequestError, match=r"--region position\.elbow: it is given twice"):
+        ArmAgent(yes=True, region=("position.elbow=0:1", "position.elbow=-9:9"))()
 
 
 @pytest.mark.parametrize("region", ["tool.position", "tool.position=", "tool.position=1", "=1:2", "a=1:2:3", "a=x:y"])
@@ -422,6 +514,25 @@ def test_folder_that_others_may_enter_is_refused(folders: Path) -> None:
     (folders / "ibrobot").chmod(0o755)
     with pytest.raises(IbrobotError, match="other users may enter it: chmod 700"):
         sockets_folder()
+
+
+def test_folder_is_the_same_for_a_program_that_starts_with_few_variables(
+    folders: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the SDK of the protocol starts `ibrobot mcp`; the person's terminal has those of the session."""
+    monkeypatch.setattr("ibrobot_mcp.persons._RUNTIMES", folders / "run")
+    monkeypatch.setattr("ibrobot_mcp.persons._WITHOUT", folders / "tmp")
+    session = folders / "run" / str(os.getuid())
+    session.mkdir(parents=True)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(session))
+    monkeypatch.setenv("TMPDIR", str(folders / "elsewhere"))
+    of_terminal = sockets_folder()
+    for variable in ("XDG_RUNTIME_DIR", "TMPDIR"):
+        monkeypatch.delenv(variable)
+    assert sockets_folder() == of_terminal == session / "ibrobot"
+    of_terminal.rmdir()
+    session.rmdir()
+    assert sockets_folder() == folders / "tmp" / f"ibrobot-{os.getuid()}"
 
 
 def test_nothing_but_sockets_of_killed_runs_is_removed_from_the_folder(folders: Path) -> None:

@@ -17,6 +17,7 @@ from ibrobot_mcp.server import PIPES, has_failed, key_of
 from mcp import Client, MCPError
 from mcp.server.auth.middleware.bearer_auth import AuthenticatedUser
 from mcp.server.auth.provider import AccessToken
+from mcp_types import EmptyResult
 
 from .conftest import STATE, STOP, Rig
 
@@ -257,6 +258,34 @@ def test_pings_are_signs_of_life_of_clients_that_answer_them(rig: Rig) -> None:
         known.agent.heard_ns = -1
         await rig.server._ping(known)
         assert known.agent.heard_ns >= 0
+
+    rig.talk(act, "legacy")
+
+
+@pytest.mark.parametrize("answer", [{"_meta": 5}, {"_meta": []}, {"resultType": 5}])
+def test_answers_to_pings_that_make_no_sense_end_nothing(rig: Rig, answer: Any) -> None:
+    async def act(client: Client) -> None:
+        await client.list_tools()
+        (known,) = rig.server._clients.values()
+
+        async def send_ping() -> None:
+            EmptyResult.model_validate(answer)
+
+        known.session = SimpleNamespace(send_ping=send_ping)
+        known.agent.heard_ns = -1
+        await rig.server._ping(known)
+        assert known.agent.heard_ns == -1
+
+    rig.talk(act, "legacy")
+
+
+def test_schemas_are_made_once(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Agents may list the tools as often as they like."""
+
+    async def act(client: Client) -> None:
+        first = (await client.list_tools()).tools
+        monkeypatch.setattr("ibrobot_mcp.tools.OptionSchemas", lambda: 1 / 0)
+        assert (await client.list_tools()).tools == first
 
     rig.talk(act, "legacy")
 
