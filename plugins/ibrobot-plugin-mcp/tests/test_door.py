@@ -679,6 +679,19 @@ def test_slow_disk_delays_no_end_of_an_authority_and_loses_nothing(
     disk.close()
 
 
+def test_log_that_is_removed_is_begun_again(door: AgentDoor, folders: Path) -> None:
+    path = audit.audit_path(door.session)
+    authority = authority_of(door.session)
+    authority.join("claude")
+    while not path.exists() or b"joined" not in path.read_bytes():
+        threading.Event().wait(0.01)
+    path.unlink()
+    path.parent.rmdir()
+    ask(next(running()), "/agent/arm", {"seconds": 60, "services": ["/test/move"]})
+    door.stop()
+    assert [json.loads(line)["event"] for line in path.read_text().splitlines()] == ["armed", "ended"]
+
+
 def test_line_that_a_full_disk_has_torn_stays_alone(door: AgentDoor, folders: Path) -> None:
     path = log_file(folders)
     path.write_text('{"event": "cal')
