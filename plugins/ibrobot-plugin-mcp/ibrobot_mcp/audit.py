@@ -100,9 +100,7 @@ class AuditFile:
                     continue
                 left = left or self._waiting[0][1]
                 try:
-                    if (
-                        descriptor >= 0 and not os.fstat(descriptor).st_nlink
-                    ):  # it is removed: what follows would be lost
+                    if descriptor >= 0 and not os.fstat(descriptor).st_nlink:  # removed: what follows would be lost
                         stack.close()
                         descriptor, left = -1, self._waiting[0][1]
                     if descriptor < 0:
