@@ -14,6 +14,9 @@ from ibrobot_core.app import PlanCode
 
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]])
 ONE = np.array([[0, 1, 2]])
+BLOCK = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)])
+PLATE = BLOCK * [1, 1, 2e-8]
+"""Coal ends the process when it makes its convex hull."""
 
 MALFORMED = {
     "box with two lengths": (lambda: Box((1.0, 2.0)), r"size is \[1.0, 2.0\], must be three lengths"),
@@ -35,6 +38,11 @@ MALFORMED = {
     "mesh without area": (lambda: Mesh(TRIANGLE * [1, 0, 0], ONE), "the mesh has no area"),
     "mesh in millimetres": (lambda: Mesh(TRIANGLE * 400, ONE), "400 m across; for millimetres give scale: 0.001"),
     "flat hull": (lambda: Mesh(TRIANGLE, ONE, convex=True), "a flat mesh has no convex hull"),
+    "hull that is flat but for rounding": (lambda: Mesh(PLATE, ONE, convex=True), "a flat mesh has no convex hull"),
+    "hull that is flat but for rounding, far away": (
+        lambda: Mesh(BLOCK + 1e9, ONE, convex=True),
+        "a flat mesh has no convex hull",
+    ),
     "voxels without cells": (lambda: Voxels(0.01, np.zeros((0, 3), int)), r"cells have shape \(0, 3\)"),
     "voxels between cells": (lambda: Voxels(0.01, np.zeros((1, 3))), "cells are float64, must be whole numbers"),
     "voxels without size": (lambda: Voxels(0.0, np.zeros((1, 3), int)), "size is 0.0 m"),

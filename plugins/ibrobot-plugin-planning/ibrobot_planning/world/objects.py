@@ -24,6 +24,9 @@ FLOOR = "floor"
 """Name of the object that the option `floor` of a planner adds."""
 _LARGEST_M = 100.0
 """Sizes above this are most likely millimetres."""
+_FLATTEST_M, _FLATTEST = 1e-9, 1e-6
+"""Meshes flatter than this [m], or than this share of their largest coordinate, count as flat: Coal ends the process
+when it makes the convex hull of one whose thickness is lost in rounding, e.g. of a tilted plate in single precision."""
 
 
 def _positive(instance: object, attribute: attrs.Attribute[float], value: float) -> None:
@@ -127,7 +130,8 @@ class Mesh:
         corners = vertices[triangles]
         if not np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).max() > 0:
             raise ValueError("the mesh has no area")
-        if self.convex and np.linalg.matrix_rank(vertices - vertices.mean(axis=0), tol=1e-9) < 3:
+        flat = max(_FLATTEST_M, _FLATTEST * float(np.abs(vertices).max()))
+        if self.convex and np.linalg.matrix_rank(vertices - vertices.mean(axis=0), tol=flat) < 3:
             raise ValueError("a flat mesh has no convex hull; leave convex out")
 
 
