@@ -115,3 +115,25 @@ def test_a_region_with_a_link_that_is_not_there_is_refused(make: Make, tmp_path:
     region = "control.guard={type: clearance, regions: {tray: {lower: [0, 0, 0], upper: [1, 1, 1], links: [hnad]}}}"
     with pytest.raises(ConfigError, match=r"control\.guard\.regions\.tray\.links\.0: unknown link 'hnad'.*hand"):
         make(region, text=robot_yaml(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("guard", "world", "warned"),
+    [
+        ("may_touch: {floor: [hnad]}", "", "may_touch.floor: there is no link or object 'hnad', did you mean 'hand'?"),
+        ("may_touch: {flor: [hand]}", "", "may_touch.flor: there is no link or object 'flor', did you mean 'floor'?"),
+        ("free: {cup: [hand, finger]}", "", "free.cup: there is no link or object 'cup'; known: "),
+        ("free: {cup: [hand, finger]}", "{objects: {cup: {shape: sphere, radius: 0.1, position: [1, 1, 1]}}}", ""),
+        ("may_touch: {floor: [hand, finger]}", "", ""),
+        ("free: {}", "", ""),
+    ],
+)
+def test_a_permission_for_a_name_that_is_not_there_is_warned_of(
+    make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture, guard: str, world: str, warned: str
+) -> None:
+    """It may be an object that comes later, so it is no fault."""
+    text = robot_yaml(tmp_path) + (f"world: {world}\n" if world else "")
+    make(f"control.guard={{type: clearance, {guard}}}", text=text).start()
+    lines = [record.getMessage() for record in caplog.records if "no link or object" in record.getMessage()]
+    assert len(lines) == (1 if warned else 0)
+    assert not warned or lines[0].startswith(f"control.guard.{warned}")

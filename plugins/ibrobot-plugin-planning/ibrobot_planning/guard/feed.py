@@ -6,7 +6,7 @@ from typing import override
 
 from ibrobot_core.app import CONTROL, RunView, SessionWorker
 from ibrobot_planning.guard.changes import WorldChange
-from ibrobot_planning.guard.notice import notice
+from ibrobot_planning.guard.notice import say
 from ibrobot_planning.world.objects import World, observed_world
 
 _MOST = 16
@@ -24,7 +24,7 @@ class GuardFeed(SessionWorker):
 
     @override
     def setup(self) -> None:
-        self.session.log.info("%s", notice(self.session.config))
+        say(self.session)
         self._states = self.session.watch_states()
         self._update()
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import override
 
-from ibrobot_core.api import MissingDependency
+from ibrobot_core.api import MissingDependency, did_you_mean
 from ibrobot_core.app import Component, RobotConfig, RunView
 from ibrobot_planning.guard.options import ClearanceGuardOptions
 from ibrobot_planning.world.engines import find_engines
+from ibrobot_planning.world.objects import FLOOR
+from ibrobot_planning.world.options import WorldOptions, link_names
 
 
 class GuardNotice(Component):
@@ -19,11 +22,36 @@ class GuardNotice(Component):
 
     @override
     def start(self) -> None:
-        self._session.log.info("%s", self.summary)
+        say(self._session)
 
     @override
     def stop(self) -> None:
         pass
+
+
+def say(session: RunView) -> None:
+    """Log what the commands of a run are guarded against, and names that permit nothing."""
+    session.log.info("%s", notice(session.config))
+    for line in unknown_names(session.config):
+        session.log.warning("%s", line)
+
+
+def unknown_names(config: RobotConfig) -> Iterator[str]:
+    """Names in `may_touch` and `free` of the guard that nothing has, e.g. of a link that was renamed."""
+    guard, section = config.control.guard, config.plugin_sections.get("world")
+    world = WorldOptions() if section is None else section.options
+    links = link_names(config.robot)
+    if guard is None or not isinstance(guard.options, ClearanceGuardOptions) or not links:
+        return
+    if world.scene:  # its objects are known only when it runs
+        return
+    known = [*links, FLOOR, *world.objects, *world.clouds]
+    for key, permitted in (("may_touch", guard.options.may_touch), ("free", guard.options.free)):
+        for name, others in (permitted or {}).items():
+            for other in (name, *others):
+                if other not in known:
+                    hint = did_you_mean(other, known, "known")
+                    yield f"control.guard.{key}.{name}: there is no link or object {other!r}{hint}"
 
 
 def notice(config: RobotConfig) -> str:
