@@ -13,7 +13,7 @@ from ibrobot_planning.guard import notice as notices
 from ibrobot_planning.guard import unsaid as unsaids
 from ibrobot_planning.guard.unsaid import unsaid
 
-from ibrobot_core.api import MissingDependency
+from ibrobot_core.api import MissingDependency, String
 from ibrobot_core.app import ConfigError, RobotConfig
 
 from .conftest import Make
@@ -137,3 +137,17 @@ def test_a_permission_for_a_name_that_is_not_there_is_warned_of(
     lines = [record.getMessage() for record in caplog.records if "no link or object" in record.getMessage()]
     assert len(lines) == (1 if warned else 0)
     assert not warned or lines[0].startswith(f"control.guard.{warned}")
+
+
+@pytest.mark.parametrize("world", ["", "world: {objects: {}}\n"])
+@pytest.mark.parametrize("acted", [False, True])
+def test_a_run_says_at_its_end_whether_the_guard_acted(
+    make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture, world: str, acted: bool
+) -> None:
+    run = make(FLOOR, text=robot_yaml(tmp_path) + world)
+    with caplog.at_level(logging.INFO):
+        run.start()
+        for text in ('{"first": "hand"}', "") if acted else ():
+            run.session.bus.publish("/guard", String(text), latched=True)
+        run.stop()
+    assert ("the guard held the arm back" in caplog.text) is acted

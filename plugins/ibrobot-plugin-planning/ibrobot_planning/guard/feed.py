@@ -6,7 +6,7 @@ from typing import override
 
 from ibrobot_core.app import CONTROL, RunView, SessionWorker
 from ibrobot_planning.guard.changes import WorldChange
-from ibrobot_planning.guard.notice import say
+from ibrobot_planning.guard.notice import say, say_whether_it_acted
 from ibrobot_planning.world.objects import World, observed_world
 
 _MOST = 16
@@ -32,6 +32,10 @@ class GuardFeed(SessionWorker):
     def work(self, timeout_s: float) -> None:
         if self._states.get(timeout_s) is not None:
             self._update()
+
+    @override
+    def teardown(self) -> None:
+        say_whether_it_acted(self.session)
 
     def _update(self) -> None:
         observed = observed_world(self.session.bus)

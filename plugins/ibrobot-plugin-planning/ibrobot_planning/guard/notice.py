@@ -26,7 +26,7 @@ class GuardNotice(Component):
 
     @override
     def stop(self) -> None:
-        pass
+        say_whether_it_acted(self._session)
 
 
 def say(session: RunView) -> None:
@@ -34,6 +34,12 @@ def say(session: RunView) -> None:
     session.log.info("%s", notice(session.config))
     for line in unknown_names(session.config):
         session.log.warning("%s", line)
+
+
+def say_whether_it_acted(session: RunView) -> None:
+    """Log that the guard held the arm back: nothing else says so of a run without page and panel."""
+    if "/guard" in session.bus.latched():
+        session.log.info("the guard held the arm back during this run; the topic /guard says when, and from what")
 
 
 def unknown_names(config: RobotConfig) -> Iterator[str]:
