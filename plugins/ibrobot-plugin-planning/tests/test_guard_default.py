@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from ibrobot_planning.guard import unsaid as unsaids
 from ibrobot_planning.guard.unsaid import unsaid
 
 from ibrobot_core.api import MissingDependency, String
-from ibrobot_core.app import ConfigError, RobotConfig
+from ibrobot_core.app import ComponentFailed, ConfigError, RobotConfig
 
 from .conftest import Make
 from .test_motion import robot_yaml
@@ -137,6 +138,16 @@ def test_a_permission_for_a_name_that_is_not_there_is_warned_of(
     lines = [record.getMessage() for record in caplog.records if "no link or object" in record.getMessage()]
     assert len(lines) == (1 if warned else 0)
     assert not warned or lines[0].startswith(f"control.guard.{warned}")
+
+
+def test_a_model_without_geometry_says_how_to_go_on(make: Make, tmp_path: Path) -> None:
+    text = robot_yaml(tmp_path)
+    model = tmp_path / "arm.xml"
+    bare = re.sub(r"<geom[^>]*/>", "", model.read_text())
+    model.write_text(bare.replace("<joint ", '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><joint '))
+    run = make(FLOOR, "default_control_mode=idle", text=text)
+    with pytest.raises(ComponentFailed, match=r"no geometry that could collide.*control\.guard: null"):
+        run.start()
 
 
 @pytest.mark.parametrize("world", ["", "world: {objects: {}}\n"])

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio
 from ibrobot_kinematics.poses import matrix
 
-from ibrobot_core.api import Context, SteppedClock, Vector, seconds
+from ibrobot_core.api import Context, PlanningError, SteppedClock, Vector, seconds
 from ibrobot_core.app import Guard
 from ibrobot_planning.guard.building import Building, Finished
 from ibrobot_planning.guard.changes import WorldChange
@@ -48,7 +48,10 @@ class ClearanceGuard(Guard):
 
     def __init__(self, options: ClearanceGuardOptions, context: Context) -> None:
         self._options = options
-        self._arm: Arm = may_touch_arm(context.robot, context.log)
+        try:
+            self._arm: Arm = may_touch_arm(context.robot, context.log)
+        except PlanningError as error:
+            raise PlanningError(f"{error}; control.guard: null switches the guard off", error.code) from None
         if self._arm.only_visible:
             links = ", ".join(self._arm.only_visible)
             context.log.info("the guard takes hulls of visible meshes for links without collision geometry: %s", links)
