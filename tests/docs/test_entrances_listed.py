@@ -94,7 +94,8 @@ PAGE_COMMANDS = {
     "/set_mode": "page mode", "/planning/go_to": "page goal", "/intervene": "page intervene",
     **dict.fromkeys(
         (
-            "/action_dispatcher/toggle_smoothing", "/planning/cancel", "/record_episode/discard", "abandoned",
+            "/action_dispatcher/toggle_smoothing", "/agent/arm", "/agent/disarm", "/planning/cancel",
+            "/record_episode/discard", "abandoned",
             "/record_episode/redo", "/record_episode/start", "/record_episode/stop", "finish", "operate", "preview",
             "release", "resign", "time",
         ),

@@ -7,11 +7,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ibrobot_provenance.files import replace_file
 from ibrobot_provenance.report_page import as_page
 from ibrobot_provenance.reports import Case, Cases, Fix, ReportSection, Table, Text
 from ibrobot_provenance.svg import tag
 
-from ibrobot_core.api import DatasetError, replace_file
+from ibrobot_core.api import DatasetError
 from ibrobot_diagnose.cause import Shown
 from ibrobot_diagnose.contents import figures
 from ibrobot_diagnose.options import CHECK

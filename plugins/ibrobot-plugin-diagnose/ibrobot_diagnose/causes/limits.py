@@ -86,8 +86,6 @@ class GuardHeld(Cause):
 
     @override
     def test(self, window: Window, reference: Reference) -> Evidence | None:
-        if not window.guarded:  # a guard that held nothing back says nothing
-            return None
         end_ns = int(window.ticks_ns[-1]) if len(window.ticks_ns) else 0
         held: dict[str, int] = {}
         begins = [*(since for since, _ in window.guarded), end_ns]
