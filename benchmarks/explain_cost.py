@@ -35,7 +35,7 @@ def record(folder: Path, **options: Any) -> None:
 
     run = Run(picture=lambda camera, picture, t_s: np.kron(picture, np.ones((LARGER, LARGER, 1), np.uint8)), **options)
     descriptor = installed_plugins().find("recorder", "mcap")
-    made, recorder = Made(run), descriptor.make(descriptor.options(), host_context())
+    made, recorder = Made(run), descriptor.make(descriptor.options(images="jpeg"), host_context())
     summary = made.summary()
     folder.parent.mkdir(parents=True, exist_ok=True)
     topics = {topic: each.type for topic, each in summary.topics.items()}

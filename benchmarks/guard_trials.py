@@ -169,10 +169,14 @@ class Judge:
         return away[counts], required[counts], pairs[counts]
 
     def distance(self, q: Vector, names: set[str]) -> float:
-        """Distance of two things at `q`, shape (J,) [m]."""
-        away, _, pairs = self.look(q)
-        named = [{self._names[a], self._names[b]} == names for a, b in pairs.tolist()]
-        return float(away[named].min(initial=self._seen))
+        """Distance of two things at `q`, shape (J,) [m]; contacts with a margin lack some pairs, and are less exact."""
+        self.look(q)
+        solid = np.flatnonzero(self.model.geom_contype | self.model.geom_conaffinity).tolist()
+        return min(
+            mujoco.mj_geomDistance(self.model, self.data, a, b, self._seen, None)
+            for a, b in itertools.combinations(solid, 2)
+            if {self._names[a], self._names[b]} == names and np.isfinite(self._required[a, b])
+        )
 
     def room(self, q: Vector) -> tuple[float, float]:
         """Least distance of pairs that may not touch, and of all pairs beyond what they must keep [m]."""
@@ -495,7 +499,12 @@ def _moving(station: Station, judge: Judge, rng: np.random.Generator) -> tuple[L
         judge.put({})
         begin, goal = start(station, judge, rng), start(station, judge, rng)
         loop, alone = Loop(station, begin), Loop(station, begin)
-        way = [alone.tick(goal) for _ in range(150)]
+        way, held = [], False
+        for _ in range(150):
+            way.append(alone.tick(goal))
+            held = held or bool(alone.overruled)
+        if held:  # the arm's own links hold it back: it would say these
+            continue
         count = int(rng.integers(3, 40))
         if any(loop.tick(goal) is None or loop.overruled for _ in range(count)):
             continue

@@ -124,6 +124,7 @@ def test_dry_run_prints_the_plan_and_starts_nothing(launch: Callable[..., Ran], 
         "status",
         "description",
         "goals",
+        "guard",
         "tool_pose",
     ]
     assert "planner rrt_connect" in components[3]["summary"]

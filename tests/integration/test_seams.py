@@ -38,6 +38,8 @@ MOVES: tuple[RunCommand, ...] = (
     messages.Call("/intervene", True),
     messages.Call("/planning/go_to", {"goal": "home"}),
     messages.Call("/planning/cancel"),
+    messages.Call("/agent/arm", {"agent": "scout", "seconds": 60, "speed": 0.25, "by": "page"}),
+    messages.Call("/agent/disarm"),
     messages.Preview("home"),
 )
 """The commands of a page that call services of the run, with requests as its scripts write them."""
@@ -97,7 +99,9 @@ def test_the_page_calls_services_as_their_owners_declare_them() -> None:
 
 def test_every_service_that_pages_may_call_is_called() -> None:
     scripts = "".join(path.read_text(encoding="utf-8") for path in (PAGE / "static").rglob("*.js"))
-    named = set(re.findall(r"[\"\'`](/(?:set_mode|intervene|planning/\w+|action_dispatcher/\w+))[\"\'`]", scripts))
+    named = set(
+        re.findall(r"[\"\'`](/(?:set_mode|intervene|agent/\w+|planning/\w+|action_dispatcher/\w+))[\"\'`]", scripts)
+    )
     record = re.findall(
         r'button\((?:"[^"]+"|text), "\w", "(\w+)"', (PAGE / "static/record.js").read_text(encoding="utf-8")
     )
