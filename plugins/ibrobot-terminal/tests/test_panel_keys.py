@@ -35,6 +35,7 @@ class Rig:
             request=SimpleNamespace(lockstep=False), stops=0, mode_keys={}, sensors={}, state=None, fail=self._fail
         )
         session.clock = SimpleNamespace(now_ns=lambda: 0)
+        session.bus = SimpleNamespace(latched=dict)
         runtime: Any = SimpleNamespace(session=session, reset=self._reset)
         self.panel = Panel(runtime, RunHooks(), stack, err=True)
 
