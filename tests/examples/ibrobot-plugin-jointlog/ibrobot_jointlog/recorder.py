@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, override
 
 import attrs
-from ibrobot_provenance.files import replace_file
 
 from ibrobot_core.api import NS_PER_S, Context, EpisodeEnd, EpisodeStart, JointState, Message, Recorder, RecorderError
 from ibrobot_jointlog.log import LOG, METADATA, TOPIC, header, row
@@ -155,6 +154,9 @@ class JointLogRecorder(Recorder):
         }
         path = start.directory / METADATA
         try:
-            replace_file(path, json.dumps(facts, indent=2, ensure_ascii=False))
+            # A process that is killed leaves the old file or the new one, and no part of one.
+            new = path.with_suffix(".new")
+            new.write_text(json.dumps(facts, indent=2, ensure_ascii=False), encoding="utf-8")
+            new.replace(path)
         except OSError as error:
             raise RecorderError(f"{path}: {error}") from error
