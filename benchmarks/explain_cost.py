@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -21,6 +23,8 @@ import numpy as np
 from figures import report
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "shared"))
+MOST_MB = 300
+"""Most memory of a process that explains [MB]."""
 LARGER = 7
 """How many times as large as usual the pictures are, in each direction."""
 
@@ -46,8 +50,14 @@ def record(folder: Path, **options: Any) -> None:
     recorder.close()
 
 
-def measured(*words: str | Path) -> tuple[float, float, float]:
-    """Seconds, seconds of processors and memory of the largest process [MB] of a command."""
+def recorded(folder: Path, **options: Any) -> None:
+    """As `record`, in a process of its own: one that is forked from a large one counts as large itself."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        pool.submit(record, folder, **options).result()
+
+
+def measured(*words: str | Path) -> tuple[float, float]:
+    """Seconds and memory of the largest process [MB] of a command."""
     begin = perf_counter()
     process = subprocess.Popen(
         [Path(sys.executable).with_name("ibrobot"), *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
@@ -55,7 +65,7 @@ def measured(*words: str | Path) -> tuple[float, float, float]:
     _, status, used = os.wait4(process.pid, 0)
     if status:
         raise SystemExit(f"{words[0]} ended with {os.waitstatus_to_exitcode(status)}")
-    return perf_counter() - begin, used.ru_utime + used.ru_stime, used.ru_maxrss / 1e3
+    return perf_counter() - begin, used.ru_maxrss / 1e3
 
 
 def main() -> int:
@@ -67,10 +77,10 @@ def main() -> int:
     work = arguments.work.absolute()
     long, card = work / "long" / "episodes" / "episode_000001", work / "reference.json"
     if not long.exists():
-        record(long, seed=1, seconds=arguments.seconds, camera_hz=30.0, outcome="failure")
+        recorded(long, seed=1, seconds=arguments.seconds, camera_hz=30.0, outcome="failure")
     if not card.exists():
         for seed in range(3):
-            record(work / f"demos/episodes/episode_00000{seed + 1}", seed=seed, acts=False, camera_hz=5.0)
+            recorded(work / f"demos/episodes/episode_00000{seed + 1}", seed=seed, acts=False, camera_hz=5.0)
         measured("datasets", "card", work / "demos", "--out", card)
     alone = measured("explain", long, "--data", card, "--out", work / "report")
     many = [work / "many" / "episodes" / f"episode_{i:06d}" for i in range(1, arguments.episodes + 1)]
@@ -82,12 +92,11 @@ def main() -> int:
     job = measured("explain", *many, "--data", card, "--out", work / "reports", "--jobs", "2")
     size = sum(file.stat().st_size for file in long.iterdir()) / 1e6
     result = {
-        "seconds": alone[0], "processor_seconds": alone[1], "memory_mb": alone[2], "bag_mb": size,
-        "job_episodes": len(many), "job_seconds": job[0], "job_processor_seconds": job[1],
+        "seconds": alone[0], "memory_mb": alone[1], "bag_mb": size, "job_episodes": len(many), "job_seconds": job[0],
     }  # fmt: skip
     print(json.dumps(result))
     report(**result)
-    return 0
+    return int(alone[0] > arguments.seconds or alone[1] > MOST_MB)
 
 
 if __name__ == "__main__":

@@ -215,6 +215,12 @@ CLAIMS = (
         "`lerobot[dataset,diffusion,training]`",
     ),
     Claim(
+        "explain_cost",
+        "an episode with two cameras at 30 Hz is explained in less time than it lasts, with at most 300 MB",
+        "docs/how-to/explain-a-failure.md",
+        "explain_cost.py --episodes 4",
+    ),
+    Claim(
         "datasets_check",
         "`ibrobot datasets check` lists demonstrations with a planted fault, and seldom a good one",
         "docs/how-to/explain-a-failure.md",
