@@ -9,10 +9,10 @@
    explained with the card of the policy's training. The first line must name the fault.
 3. Healthy runs of all policies, successes and failures: nothing may be named.
 
-Demonstrations, trials, and the trials of `--tune`, on which thresholds may be chosen, have seeds of their own. A stage
-whose result is in the folder `--work` is not done again. A run is recorded there once, and explained anew each time.
-Needs LeRobot in the same environment. Prints a
-table and one JSON object with the shares of right first lines, and the false accusations.
+Demonstrations, trials, and the trials of `--tune`, on which thresholds may be chosen, have seeds of their own. The
+folder `--work` keeps demonstrations, trained policies and recorded runs for the next call; runs are explained anew each
+time. Needs LeRobot in the same environment. Prints a table and one JSON object with the shares of right first lines,
+and the false accusations.
 """
 
 from __future__ import annotations
