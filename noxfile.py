@@ -297,6 +297,19 @@ def wheels(session: nox.Session) -> None:
 
 
 @nox.session(default=False)
+def kit(session: nox.Session) -> None:
+    """`ibrobot plugins new` for each kind, or `-- KIND …`: from wheels, in an empty environment, until its robot runs.
+
+    Prints lines and seconds of each kind. Not one of `nox` alone: it makes an environment for each.
+    """
+    folder = Path(session.create_tmp()).absolute()
+    for each in ("dist", "packages"):
+        shutil.rmtree(folder / each, ignore_errors=True)
+    session.run("uv", "build", "--quiet", "--all-packages", "--wheel", "--out-dir", str(folder / "dist"))
+    session.run("python", "tests/house/new_plugins.py", str(folder / "dist"), str(folder), *session.posargs)
+
+
+@nox.session(default=False)
 def release(session: nox.Session) -> None:
     """A version from its number to checked wheels: `-- X.Y.Z`. Uploads nothing; CONTRIBUTING.md says what follows."""
     session.install("towncrier", "twine")

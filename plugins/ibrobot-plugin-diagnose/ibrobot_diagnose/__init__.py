@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from ibrobot_provenance.reports import ReportDescriptor
 
@@ -32,6 +33,15 @@ def ibrobot_kinds() -> Iterable[Kind]:
     yield Kind(KIND, "ibrobot_causes", CauseDescriptor)
     yield Kind(ARM_VIEW, "ibrobot_arm_views", Descriptor)
     yield Kind(DEVICE_POSE, "ibrobot_device_poses", Descriptor)
+
+
+@hookimpl(optionalhook=True)
+def ibrobot_samples() -> Iterable[Descriptor[Any]]:
+    """What `ibrobot plugins new` begins with."""
+    fakes = "ibrobot_diagnose.testing"
+    yield Descriptor(KIND, Late(f"{fakes}:FakeCause"), "a cause with one number")
+    yield Descriptor(ARM_VIEW, Late(f"{fakes}:FakeArmView"), "a stripe for an arm")
+    yield Descriptor(DEVICE_POSE, Late(f"{fakes}:fake_pose"), "a device that stands in the middle")
 
 
 @hookimpl

@@ -23,6 +23,8 @@ _LACKS = {
     "rig card": "there is no reference of the rig: `ibrobot preflight --take`",
     "training card": "there is no card from a training", "model": "the model was not asked: --model",
 }  # fmt: skip
+STREAMS = frozenset({*_LACKS, "demonstration"})
+"""Names of all that a cause can need."""
 
 
 def installed_causes() -> tuple[Cause, ...]:

@@ -48,6 +48,12 @@ def ibrobot_kinds() -> Iterable[Kind]:
     yield Kind("scene", "ibrobot_scenes", SceneDescriptor)
 
 
+@hookimpl(optionalhook=True)
+def ibrobot_samples() -> Iterable[Descriptor[Any]]:
+    """What `ibrobot plugins new` begins with."""
+    yield Descriptor("scene", Late("ibrobot_mujoco.mujoco_scene_suite:FakeTableScene"), "a cube on a table")
+
+
 @hookimpl
 def ibrobot_scenes() -> Iterable[SceneDescriptor]:
     """Objects around the robot, and tasks."""

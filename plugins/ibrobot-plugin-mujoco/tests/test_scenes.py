@@ -8,16 +8,14 @@ from typing import Any, ClassVar, override
 import mujoco
 import numpy as np
 import pytest
-from ibrobot_mujoco.model import build_spec
-from ibrobot_mujoco.options import MujocoOptions
+from ibrobot_mujoco.mujoco_scene_suite import MujocoSceneSuite
 from ibrobot_mujoco.scene import Scene, SceneConfig
-from ibrobot_mujoco.scene_suite import SceneSuite
 from ibrobot_mujoco.scenes import scene
 from ibrobot_mujoco.so101 import so101
 from ibrobot_mujoco.spans import ends
 from ibrobot_mujoco.world import World
 
-from ibrobot_core.api import Context, HardwareError, Robot, Vector
+from ibrobot_core.api import Context, HardwareError, Robot
 from ibrobot_core.app import ConfigError, find_config, installed_plugins, load_config
 
 LOOKS: Mapping[str, Any] = {
@@ -30,7 +28,7 @@ LOOKS: Mapping[str, Any] = {
 """All that every scene can draw."""
 
 
-class _Suite(SceneSuite[mujoco.MjSpec, World]):
+class _Suite(MujocoSceneSuite):
     """A scene around the SO-101 in its rest pose."""
 
     type: ClassVar[str]
@@ -39,58 +37,9 @@ class _Suite(SceneSuite[mujoco.MjSpec, World]):
     def config(self, **more: Any) -> SceneConfig:
         return scene(self.type, **{**LOOKS, **self.options, **more})
 
-    def robot(self) -> Robot:
-        return so101()
-
     @override
     def make(self, ctx: Context) -> Scene[mujoco.MjSpec, World]:
         return self.config().make(self.robot())
-
-    @override
-    def world(self, scene: Scene[mujoco.MjSpec, World], ctx: Context) -> World:
-        spec, _ = build_spec(MujocoOptions(scene=_Given.of(scene)), self.robot())
-        world = World.of(spec.compile())
-        self._rest(world)
-        return world
-
-    def _rest(self, world: World) -> None:
-        robot = self.robot()
-        for name, position in zip(robot.joint_names, robot.pose("rest"), strict=True):
-            world.data.joint(name).qpos = world.data.actuator(name).ctrl = position
-        mujoco.mj_forward(world.model, world.data)
-
-    @override
-    def begin(self, scene: Scene[mujoco.MjSpec, World], world: World, seed: int) -> Vector:
-        mujoco.mj_resetData(world.model, world.data)
-        self._rest(world)
-        factors = scene.begin(world, np.random.default_rng(seed))
-        mujoco.mj_forward(world.model, world.data)
-        return factors
-
-    @override
-    def state(self, world: World) -> Vector:
-        state: Vector = world.data.qpos.copy()
-        return state
-
-    @override
-    def looks(self, world: World) -> Vector:
-        model = world.model
-        parts = (
-            model.geom_size,
-            model.geom_rbound,
-            model.geom_rgba,
-            model.geom_friction,
-            model.body_mass,
-            model.light_diffuse,
-            model.cam_pos,
-            model.cam_quat,
-            world.data.mocap_pos,
-        )
-        return np.concatenate([np.ravel(part) for part in parts])
-
-    @override
-    def advance(self, world: World, duration_s: float) -> None:
-        mujoco.mj_step(world.model, world.data, round(duration_s / world.model.opt.timestep))
 
     @override
     def ranges(self, scene: Scene[mujoco.MjSpec, World]) -> Mapping[str, tuple[float, float]]:
@@ -103,16 +52,6 @@ class _Suite(SceneSuite[mujoco.MjSpec, World]):
     @override
     def fixed(self, ctx: Context) -> tuple[str, Scene[mujoco.MjSpec, World]]:
         return "light", self.config(light=1.0).make(self.robot())
-
-
-class _Given:
-    """A scene that exists already, in the place of its config."""
-
-    @classmethod
-    def of(cls, made: Scene[mujoco.MjSpec, World]) -> Any:
-        given = cls()
-        given.make = lambda robot: made  # type: ignore[attr-defined]
-        return given
 
 
 class TestEmpty(_Suite):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import ExecutorDescriptor, Late, hookimpl
+from ibrobot_core.api import Descriptor, ExecutorDescriptor, Late, hookimpl
 from ibrobot_core.app import Command, Kind, SectionDescriptor, SourceDescriptor
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
 from ibrobot_planning.guard.descriptor import GuardDescriptor
@@ -25,6 +25,13 @@ def ibrobot_kinds() -> Iterable[Kind]:
     """Planners and guards."""
     yield Kind("planner", "ibrobot_planners", PlannerDescriptor)
     yield Kind("guard", "ibrobot_guards", GuardDescriptor)
+
+
+@hookimpl(optionalhook=True)
+def ibrobot_samples() -> Iterable[Descriptor[Any]]:
+    """What `ibrobot plugins new` begins with."""
+    yield Descriptor("planner", Late("ibrobot_planning.suite:FakePlanner"), "a planner with joint goals")
+    yield Descriptor("guard", Late("ibrobot_planning.suite:FakeGuard"), "a guard with one number for a world")
 
 
 @hookimpl

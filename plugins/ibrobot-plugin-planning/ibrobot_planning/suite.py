@@ -1,17 +1,29 @@
-"""The conformance suite of planners, and a planner for tests; both need `ibrobot-testing`."""
+"""The conformance suite of planners, and a planner and a guard for tests; all need `ibrobot-testing`."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from typing import ClassVar, override
+from typing import Any, ClassVar, override
 
 import attrs
 import numpy as np
 import pytest
 from ibrobot_testing.suite import Suite
 
-from ibrobot_core.api import Context, Header, JointTrajectory, JointTrajectoryPoint, PlanningError, Vector, ns, seconds
-from ibrobot_core.app import PlanCode
+from ibrobot_core.api import (
+    Context,
+    HardwareError,
+    Header,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    PlanningError,
+    Vector,
+    ns,
+    seconds,
+)
+from ibrobot_core.app import Guard, PlanCode
 from ibrobot_planning.planner import JointGoal, Planner, PlanRequest, PlanResult
 
 
@@ -217,3 +229,39 @@ def _cubic_point(start: Vector, end: Vector, duration: float, share: float) -> J
     position = start + (end - start) * (3 * share**2 - 2 * share**3)
     velocity = (end - start) * (6 * share - 6 * share**2) / duration
     return JointTrajectoryPoint(ns(duration * share), position, velocity)
+
+
+class FakeGuard(Guard):
+    """Keeps the sum of all positions below a limit.
+
+    A change of the world, `{"most": 2.0}`, sets another limit.
+
+    Args:
+        ctx: provides the joints.
+        most: largest sum of the positions [rad].
+    """
+
+    def __init__(self, ctx: Context, most: float = 3.0) -> None:
+        self._joints = ctx.robot.joint_names
+        self._most = most
+        self.counts = {"held": 0}
+
+    @override
+    def accept(self, position: Vector, velocity: Vector, setpoint: Vector, measured: Vector) -> Vector:
+        if setpoint.sum() <= max(self._most, position.sum()):
+            self.overruled = ""
+            return setpoint
+        self.counts = {"held": self.counts["held"] + 1}
+        if not self.overruled:
+            distance = self._most - float(position.sum())
+            text = f"the joints were {distance:.3f} rad from their limit"
+            pair = {"first": self._joints[0], "second": "the limit", "distance": distance, "text": text}
+            self.overruled = json.dumps(pair)
+        return position
+
+    @override
+    def world(self, change: Mapping[str, Any]) -> None:
+        most = change.get("most")
+        if not isinstance(most, float) or not np.isfinite(most):
+            raise HardwareError(f"a change of the world needs most, a number [rad]; got {dict(change)}")
+        self._most = most

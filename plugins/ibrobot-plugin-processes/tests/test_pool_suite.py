@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import os
 import signal
@@ -16,6 +17,7 @@ import ibrobot_processes.pool
 import pytest
 from ibrobot_provenance.jobs import Done, Job, Pool, open_pool
 from ibrobot_provenance.pool_suite import PoolSuite
+from ibrobot_testing import checks
 from ibrobot_testing.pool_jobs import Order, wait
 
 from ibrobot_core.app import ComponentFailed, RequestError
@@ -107,42 +109,39 @@ class GoesOn(Wrong):
             yield done
 
 
-@pytest.mark.parametrize(
-    ("kind", "check"),
-    [
-        (Twice, lambda suite, path: suite.test_each_job_is_done_once(1)),
-        (AllAtOnce, lambda suite, path: suite.test_jobs_begin_in_their_order_when_there_is_room_for_them()),
-        (Unwatched, lambda suite, path: suite.test_progress_of_all_jobs_is_counted()),
-        (PlainErrors, lambda suite, path: suite.test_error_of_a_job_is_its_own()),
-        (HidesErrors, lambda suite, path: suite.test_bug_in_a_job_is_an_error()),
-        (HidesErrors, lambda suite, path: suite.test_job_that_kills_each_process_fails_and_others_do_not()),
-        (GivesUp, lambda suite, path: suite.test_job_whose_process_is_killed_is_run_again(path)),
-        (GoesOn, lambda suite, path: suite.test_closing_ends_the_jobs_that_run(path)),
-    ],
-    ids=lambda value: value.__name__ if isinstance(value, type) else "",
-)
-def test_wrong_pool_fails(kind: Any, check: Any, tmp_path: Path) -> None:
+WRONG = [
+    (Twice, "each_job_is_done_once"),
+    (AllAtOnce, "jobs_begin_in_their_order_when_there_is_room_for_them"),
+    (Unwatched, "progress_of_all_jobs_is_counted"),
+    (PlainErrors, "error_of_a_job_is_its_own"),
+    (HidesErrors, "bug_in_a_job_is_an_error"),
+    (HidesErrors, "job_that_kills_each_process_fails_and_others_do_not"),
+    (GivesUp, "job_whose_process_is_killed_is_run_again"),
+    (GoesOn, "closing_ends_the_jobs_that_run"),
+    (KeepsProcesses, "own_processes_run_one_job_each_in_the_same_folder"),
+    (OtherFolder, "own_processes_run_one_job_each_in_the_same_folder"),
+]
+
+
+@pytest.mark.parametrize(("kind", "check"), WRONG, ids=lambda value: getattr(value, "__name__", value))
+def test_wrong_pool_fails(kind: Any, check: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Subject(PoolSuite):
         patience_s = 2.0
 
         def pool(self, jobs):
             return kind(jobs)
 
+    given = {"jobs": 1, "tmp_path": tmp_path, "monkeypatch": monkeypatch}
+    bound = getattr(Subject(), f"test_{check}")
     with pytest.raises((AssertionError, ComponentFailed)):
-        check(Subject(), tmp_path)
+        bound(**{name: given[name] for name in inspect.signature(bound).parameters})
     for running in GoesOn.left:
         running.close()
     GoesOn.left.clear()
 
 
-@pytest.mark.parametrize("kind", [KeepsProcesses, OtherFolder], ids=lambda kind: kind.__name__)
-def test_wrong_processes_fail(kind: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Subject(PoolSuite):
-        def pool(self, jobs):
-            return kind(jobs)
-
-    with pytest.raises(AssertionError):
-        Subject().test_own_processes_run_one_job_each_in_the_same_folder(tmp_path, monkeypatch)
+def test_every_check_catches_something() -> None:
+    assert checks(PoolSuite) == {check for _, check in WRONG}
 
 
 def test_processes_have_no_address() -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
-from ibrobot_core.api import hookimpl
+from ibrobot_core.api import Descriptor, Late, hookimpl
 from ibrobot_core.app import Kind
 from ibrobot_provenance.datasets import DatasetDescriptor
 from ibrobot_provenance.jobs import PoolDescriptor
@@ -17,3 +18,12 @@ def ibrobot_kinds() -> Iterable[Kind]:
     yield Kind("pool", "ibrobot_pools", PoolDescriptor)
     yield Kind("dataset", "ibrobot_datasets", DatasetDescriptor)
     yield Kind("report", "ibrobot_reports", ReportDescriptor)
+
+
+@hookimpl(optionalhook=True)
+def ibrobot_samples() -> Iterable[Descriptor[Any]]:
+    """What `ibrobot plugins new` begins with."""
+    fakes = "ibrobot_provenance.fakes"
+    yield Descriptor("pool", Late(f"{fakes}:FakePool"), "a pool with a process for each job")
+    yield Descriptor("dataset", Late(f"{fakes}:FakeDataset"), "a writer of datasets as NumPy's files")
+    yield Descriptor("report", Late(f"{fakes}:fake_report"), "a report on folders with one file")

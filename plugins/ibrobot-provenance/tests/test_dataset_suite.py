@@ -2,62 +2,15 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any, override
+from typing import override
 
 import numpy as np
 import pytest
 from ibrobot_provenance.dataset_suite import DatasetSuite
-from ibrobot_provenance.datasets import DatasetWriter
+from ibrobot_provenance.fakes import FakeDataset
 from ibrobot_testing import checks, failed_checks
-from numpy.typing import NDArray
 
-from ibrobot_core.api import Context, DatasetError, Feature
-
-
-class FakeDataset(DatasetWriter):
-    """Writes each episode to `episode_N.npz`: one array per feature, and the tasks."""
-
-    def __init__(self, ctx: Context) -> None:
-        self._root: Path | None = None
-        self._features: Mapping[str, Feature] = {}
-        self._frames: list[dict[str, NDArray[np.generic]]] = []
-        self._episodes = 0
-
-    @override
-    def create(self, root: Path, fps: float, features: Mapping[str, Feature], metadata: Mapping[str, Any]) -> None:
-        if root.exists() and any(root.iterdir()):
-            raise DatasetError(f"{root} is not empty")
-        root.mkdir(parents=True, exist_ok=True)
-        (root / "metadata.json").write_text(json.dumps({"fps": fps, **metadata}))
-        self._root, self._features = root, features
-
-    @override
-    def add_frame(self, values: Mapping[str, NDArray[np.generic]], task: str) -> None:
-        if self._root is None:
-            raise DatasetError("create comes before add_frame")
-        for key in sorted(self._features.keys() ^ values.keys()):
-            raise DatasetError(f"{key} is {'missing' if key in self._features else 'not a feature of this dataset'}")
-        for key, feature in self._features.items():
-            if values[key].shape != feature.shape:
-                raise DatasetError(f"{key} must have shape {feature.shape}, got {values[key].shape}")
-        self._frames.append({key: np.array(value) for key, value in values.items()} | {"task": np.array(task)})
-
-    @override
-    def save_episode(self) -> int:
-        if self._root is None or not self._frames:
-            raise DatasetError("the episode has no frames")
-        columns = {key: np.stack([frame[key] for frame in self._frames]) for key in self._frames[0]}
-        np.savez(self._root / f"episode_{self._episodes}.npz", **columns)  # type: ignore[arg-type]
-        self._frames = []
-        self._episodes += 1
-        return self._episodes - 1
-
-    @override
-    def finalize(self) -> None:
-        self._frames = []
+from ibrobot_core.api import DatasetError
 
 
 class TestDataset(DatasetSuite):

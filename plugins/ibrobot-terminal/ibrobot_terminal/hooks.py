@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
-from ibrobot_core.api import Late, hookimpl
+from ibrobot_core.api import Descriptor, Late, hookimpl
 from ibrobot_core.app import Kind, TerminalDescriptor
 from ibrobot_terminal.guide import GuideDescriptor, PanelDescriptor
 
@@ -25,3 +26,10 @@ def ibrobot_terminals() -> Iterable[TerminalDescriptor]:
         summary="reads the terminal's keys, and shows a live panel",
         default=True,
     )
+
+
+@hookimpl(optionalhook=True)
+def ibrobot_samples() -> Iterable[Descriptor[Any]]:
+    """What `ibrobot plugins new` begins with."""
+    yield Descriptor("guide", Late("ibrobot_terminal.fakes:fake_guide"), "a guide with a question and a table")
+    yield Descriptor("panel", Late("ibrobot_terminal.fakes:fake_panel"), "a table of the joints of a run")

@@ -1,58 +1,53 @@
-"""A class of a module as a module of its own: with what it uses of that module, and its imports."""
+"""A class or function of a module as a module of its own: with what it uses of that module, and its imports."""
 
 from __future__ import annotations
 
 import ast
-import sys
 from collections.abc import Iterator
 from types import ModuleType
 
-_WIDTH = 88
-
 
 def excerpt(module: ModuleType, name: str) -> tuple[list[str], str]:
-    """Cut a class out of a module.
+    """Cut a class or a function out of a module.
 
     Args:
         module: a module that imports no names under conditions.
-        name: the class.
+        name: the class or function.
 
     Returns:
-        Its import statements, with empty lines between their groups, and the text of what it uses of the module and of
-        itself, in their order.
+        Its import statements, and the text of what it uses of the module and of itself, in their order.
     """
     file = module.__file__
     assert file is not None
     with open(file, encoding="utf-8") as opened:
         text = opened.read()
     tree = ast.parse(text)
-    own = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
-    wanted: set[str] = set()
+    own = {defined: node for node in tree.body for defined in _defined(node)}
+    wanted: dict[str, ast.stmt] = {}
     todo = [name]
     while todo:
-        node = own[todo.pop()]
-        wanted.add(node.name)
-        todo += [used for used in _names(node) if used in own and used not in wanted]
+        each = todo.pop()
+        wanted[each] = own[each]
+        todo += [used for used in _names(own[each]) if used in own and used not in wanted]
     nodes = [node for key, node in own.items() if key in wanted]
     used = {each for node in nodes for each in _names(node)}
-    imports: list[str] = []
-    for statement in tree.body:
-        for line in _import(statement, used):
-            if imports and _group(line) != _group(imports[-1]):
-                imports.append("")
-            imports.append(line)
+    imports = [line for statement in tree.body for line in _import(statement, used)]
     lines = text.splitlines()
-    parts = []
+    parts: list[str] = []
     for node in nodes:
-        first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
-        parts.append("\n".join(lines[first - 1 : node.end_lineno]))
-    return imports, "\n\n\n".join(parts)
+        first, gap = node.lineno, "\n"
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            first, gap = min([first, *(each.lineno for each in node.decorator_list)]), "\n\n\n"
+        parts.append((gap if parts else "") + "\n".join(lines[first - 1 : node.end_lineno]))
+    return imports, "".join(parts)
 
 
-def _group(line: str) -> int:
-    """The place of an import statement: the standard library's come first, and those of ibrobot last."""
-    package = line.split()[1].partition(".")[0]
-    return 0 if package in sys.stdlib_module_names else 2 if package == "ibrobot_core" else 1
+def _defined(node: ast.stmt) -> list[str]:
+    """The names that a statement defines: of a class, a function or a constant."""
+    if isinstance(node, ast.ClassDef | ast.FunctionDef):
+        return [node.name]
+    targets = node.targets if isinstance(node, ast.Assign) else []
+    return [each.id for target in targets for each in ast.walk(target) if isinstance(each, ast.Name)]
 
 
 def _names(node: ast.AST) -> Iterator[str]:
@@ -60,15 +55,12 @@ def _names(node: ast.AST) -> Iterator[str]:
 
 
 def _import(node: ast.stmt, used: set[str]) -> Iterator[str]:
-    """An import statement without what is not used; nothing if it is none, or nothing of it is used."""
+    """An import statement of each name that is used."""
     if isinstance(node, ast.Import):
         for alias in node.names:
-            if (alias.asname or alias.name) in used:
+            if (alias.asname or alias.name.partition(".")[0]) in used:
                 yield f"import {alias.name}" + (f" as {alias.asname}" if alias.asname else "")
     elif isinstance(node, ast.ImportFrom) and node.module != "__future__":
-        names = [alias.name for alias in node.names if alias.name in used]
-        line = f"from {node.module} import {', '.join(names)}"
-        if names and len(line) > _WIDTH:
-            yield "\n".join((f"from {node.module} import (", *(f"    {each}," for each in names), ")"))
-        elif names:
-            yield line
+        for alias in node.names:
+            if alias.name in used:
+                yield f"from {node.module} import {alias.name}"

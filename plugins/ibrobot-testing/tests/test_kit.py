@@ -3,89 +3,94 @@
 from __future__ import annotations
 
 import ast
-import os
-import subprocess
-import sys
+import re
+import tomllib
 from pathlib import Path
 
 import pytest
-from ibrobot_kit.new import FAKES, NewPlugin, render
-from ibrobot_testing import ibrobot_command
+from ibrobot_kit.new import SAMPLE, NewPlugin, render
+from new_packages import LAST, NewPackages, sample_kinds
 
-from ibrobot_core.api import Descriptor
+from ibrobot_core.api import Descriptor, IbrobotError
 from ibrobot_core.app import RequestError, installed_plugins, load_config
+
+KINDS = sample_kinds("ibrobot-testing")
+"""Those of core; tests/integration/test_new_plugins.py has those of plugins."""
+TOGETHER = [kind for kind in KINDS if kind not in LAST]
+ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture(scope="module")
-def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a package of each kind, as installed by `pip install -e`."""
-    folder = tmp_path_factory.mktemp("packages")
-    for kind in FAKES:
-        made = Path(NewPlugin(kind, f"my_{kind}", folder)()["folder"])
-        metadata = made / f"ibrobot_my_{kind}-0.1.0.dist-info"
-        metadata.mkdir()
-        (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {made.name}\nVersion: 0.1.0\n")
-        (metadata / "entry_points.txt").write_text(f"[ibrobot]\nmy_{kind} = ibrobot_my_{kind}\n")
-    return folder
+def packages(tmp_path_factory: pytest.TempPathFactory) -> NewPackages:
+    return NewPackages.of(tmp_path_factory.mktemp("packages"), KINDS)
 
 
-def places(packages: Path) -> list[str]:
-    return [str(path) for path in sorted(packages.iterdir())]
+def test_every_kind_of_core_has_a_sample() -> None:
+    hooks = {f"ibrobot_{kind}s" for kind in KINDS} | {installed_plugins().all_kinds.get(kind, "") for kind in KINDS}
+    text = (ROOT / "ibrobot_core/hookspecs.py").read_text()
+    registering = {name for name in re.findall(r"^def (ibrobot_\w+)\(\) -> Iterable", text, re.MULTILINE)} - {
+        "ibrobot_kinds",
+        "ibrobot_doctor",
+    }  # a kind of one's own is no kind, and checks stand beside something else
+    assert registering - {"ibrobot_sources"} <= hooks  # whose sample offers a command, the way to a source
 
 
-def environment(packages: Path) -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(places(packages))}
-
-
-def test_tests_of_new_packages_pass(packages: Path) -> None:
-    tests = [str(path) for path in sorted(packages.glob("*/tests"))]
-    assert len(tests) == len(FAKES)
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--import-mode=importlib", *tests]
-    done = subprocess.run(command, cwd=packages, env=environment(packages), capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout
+def test_tests_of_new_packages_pass(packages: NewPackages) -> None:
+    for kinds in (TOGETHER, *([kind] for kind in LAST)):
+        done = packages.tests(kinds)
+        assert done.returncode == 0, done.stdout
 
 
 def test_new_packages_are_discovered_without_mistakes_and_their_robots_are_right(
-    packages: Path, monkeypatch: pytest.MonkeyPatch
+    packages: NewPackages, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for place in places(packages):
-        monkeypatch.syspath_prepend(place)
+    for kind in TOGETHER:
+        monkeypatch.syspath_prepend(str(packages.place(kind)))
     installed_plugins.cache_clear()
     registry = installed_plugins()
     installed_plugins.cache_clear()
     assert registry.failures == []
-    for kind in FAKES:
-        descriptor = registry.find("sensor" if kind == "camera" else kind, f"my_{kind}")
-        assert isinstance(descriptor, Descriptor)
-        assert descriptor.summary
-        (robot,) = packages.glob(f"*/my_{kind}.yaml")
+    for kind in TOGETHER:
+        interface = "sensor" if kind == "camera" else kind
+        if interface in registry.all_kinds and kind != "source":
+            descriptor = registry.find(interface, f"my_{kind}")
+            assert isinstance(descriptor, Descriptor)
+            assert descriptor.summary
         for sim in (False, True):
-            assert load_config(robot, sim=sim, registry=registry).robot.name == "tryout"
+            assert load_config(packages.robot(kind), sim=sim, registry=registry).robot.name == "tryout"
 
 
 @pytest.mark.parametrize(
-    "kind",
-    [kind if kind == "engine" else pytest.param(kind, marks=pytest.mark.long) for kind in FAKES],
+    "kind", [kind if kind in ("engine", "source") else pytest.param(kind, marks=pytest.mark.long) for kind in KINDS]
 )
-def test_robot_of_a_new_package_runs(packages: Path, kind: str) -> None:
-    (robot,) = packages.glob(f"*/my_{kind}.yaml")
-    command = [*ibrobot_command(), "launch", str(robot), "--sim", "--lockstep", "--headless", "--duration", "1"]
-    done = subprocess.run(command, env=environment(packages), capture_output=True, text=True, check=False)
+def test_robot_of_a_new_package_runs(packages: NewPackages, kind: str) -> None:
+    done = packages.launch(kind, *(() if kind == "command" else ("--lockstep",)))
     assert done.returncode == 0, done.stderr
-    assert "faults     none" in done.stdout
+    assert ("faults     none" in done.stdout) == (kind != "command")
 
 
-@pytest.mark.parametrize("kind", FAKES)
+@pytest.mark.parametrize("kind", KINDS)
 def test_every_name_in_a_new_package_is_defined_or_imported(kind: str) -> None:
     """A class that is cut out of its module brings what it needs, and nothing of the fakes is left."""
     for path, text in render(kind, "odd_one").items():
-        assert "Fake" not in text.replace("FakeArm", ""), path
         if path.endswith(".py"):
             tree = ast.parse(text)
-            statements = (node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom | ast.Import))
+            statements = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom | ast.Import)]
             imported = {alias.asname or alias.name for node in statements for alias in node.names}
             used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
             assert imported - {"annotations"} <= used, path
+            own = text.replace("FakeArm", "").replace("ibrobot_testing.fakes import FakeRecorder", "")
+            assert "Fake" not in own.replace("FakeRecorder(host", ""), path
+            assert max(len(line) for line in text.splitlines()) <= 120, path
+
+
+def test_package_has_the_licence_of_ibrobot() -> None:
+    files = render("teleop", "my_stick")
+    assert files["LICENSE"] == (ROOT / "LICENSE").read_text(encoding="utf-8")
+    project = tomllib.loads(files["pyproject.toml"])["project"]
+    assert project["dependencies"][0] == "ibrobot-core>=0.1,<0.2"
+    assert project["optional-dependencies"]["test"] == ["ibrobot-testing>=0.1,<0.2", "pytest>=8.3"]
+    assert (project["license"], project["license-files"]) == ("Apache-2.0", ["LICENSE"])
 
 
 @pytest.mark.parametrize("name", ["", "My_arm", "my-arm", "1st", "my arm", "../up", "ärm"])
@@ -95,9 +100,63 @@ def test_name_that_no_module_can_have_is_an_error(tmp_path: Path, name: str) -> 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_unknown_kind_is_named_and_so_is_a_near_one(tmp_path: Path) -> None:
+    with pytest.raises(IbrobotError, match=r"unknown sample type 'telepo', did you mean 'teleop'"):
+        NewPlugin("telepo", "my_stick", tmp_path)()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_kind_of_a_missing_package_names_the_package(tmp_path: Path) -> None:
+    if "planner" in installed_plugins().types(SAMPLE):
+        pytest.skip("the package is installed")
+    with pytest.raises(IbrobotError, match="ibrobot-plugin-planning"):
+        NewPlugin("planner", "my_planner", tmp_path)()
+
+
 def test_folder_that_exists_is_left_as_it_is(tmp_path: Path) -> None:
     (tmp_path / "ibrobot-plugin-wave").mkdir()
     (tmp_path / "ibrobot-plugin-wave/mine.py").write_text("mine")
     with pytest.raises(RequestError, match="ibrobot-plugin-wave exists; choose another name, or move it away"):
         NewPlugin("teleop", "wave", tmp_path)()
     assert [path.name for path in (tmp_path / "ibrobot-plugin-wave").iterdir()] == ["mine.py"]
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A checkout of the repository, as far as `new` looks at it."""
+    lists = ("pyproject.toml", "README.md", "README.zh.md", "plugins/ibrobot/pyproject.toml")
+    for name in (*lists, "ibrobot_core/hookspecs.py"):
+        file = tmp_path / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes((ROOT / name).read_bytes())
+    return tmp_path
+
+
+def test_in_the_repository_it_enters_what_a_package_there_needs(checkout: Path) -> None:
+    made = NewPlugin("teleop", "my_stick", checkout / "plugins")()
+    assert made["entered"] == ["pyproject.toml", "plugins/ibrobot/pyproject.toml", "README.md", "README.zh.md"]
+    sources = tomllib.loads((checkout / "pyproject.toml").read_text())["tool"]["uv"]["sources"]
+    assert sources["ibrobot-plugin-my-stick"] == {"workspace": True}
+    extras = tomllib.loads((checkout / "plugins/ibrobot/pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    assert "ibrobot-plugin-my-stick>=0.1,<0.2" in extras["all"]
+    for page in ("README.md", "README.zh.md"):
+        before, after = ((each / page).read_text().splitlines() for each in (ROOT, checkout))
+        (added,) = [line for line in after if line not in before]
+        assert added == "| `ibrobot-plugin-my-stick` | the teleop `my_stick` |"
+        assert after[after.index(added) - 1].startswith("| `ibrobot-plugin-")
+    package = checkout / "plugins/ibrobot-plugin-my-stick"
+    settings = tomllib.loads((package / "pyproject.toml").read_text())
+    assert set(settings["tool"]) == {"hatch"}, "the repository's own settings are for all"
+    assert "optional-dependencies" not in settings["project"]
+    assert not (package / ".github").exists()
+
+
+def test_repository_with_a_list_missing_is_left_as_it_is(checkout: Path) -> None:
+    (checkout / "README.zh.md").write_text("# empty\n")
+    before = (checkout / "pyproject.toml").read_text()
+    with pytest.raises(RequestError, match=r"README.zh.md: has no list of packages"):
+        NewPlugin("teleop", "my_stick", checkout / "plugins")()
+    assert (checkout / "pyproject.toml").read_text() == before
+    assert not (checkout / "plugins/ibrobot-plugin-my-stick").exists()

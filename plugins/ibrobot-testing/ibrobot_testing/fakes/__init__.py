@@ -10,7 +10,7 @@ from ibrobot_testing.fakes.host import (
     FakeTeleop,
     FakeViewer,
 )
-from ibrobot_testing.fakes.storage import FakeRecorder
+from ibrobot_testing.fakes.storage import FakeReader, FakeRecorder
 from ibrobot_testing.fakes.transport import FakeTransport
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "FakeHardware",
     "FakeImu",
     "FakePolicy",
+    "FakeReader",
     "FakeRealHardware",
     "FakeRecorder",
     "FakeSensor",
