@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import run_here
+from ibrobot_kinematics.path_constraints import CONSTRAINT_KEYS
 from ibrobot_planning.client import Client
 from ibrobot_planning.execution.requests import PlanAhead
 from ibrobot_planning.execution.services import PLAN_GOAL
@@ -33,6 +34,8 @@ PLANNER = "control_modes.moveit_planning.planner={type: rrt_connect}"
 
 _NEAR = "beyond_reach=nearest"
 """Five joints seldom reach an orientation."""
+_TILTED = "upright=0.9"
+"""In its pose `rest`, the tool is tilted by 45 degrees."""
 
 
 def documented_goals() -> list[str]:
@@ -44,6 +47,8 @@ def documented_goals() -> list[str]:
             goals.append(" ".join((goals[-1].split()[0], text, *([_NEAR] if "quaternion" in text else []))))
         elif "=" in text or text == "home":
             goals.append(text if "rpy" not in text else f"{text} {_NEAR}")
+        if "upright" in text:
+            goals += [re.sub("upright=[0-9.]+", _TILTED, text), f"wrist_roll=0.5 {_TILTED} upright_axis=-z"]
     return goals
 
 
@@ -104,11 +109,17 @@ def as_step(goal: str) -> dict[str, Any]:
     if "=" not in goal:
         return {"pose": goal}
     step: dict[str, Any] = {}
+    pose, *_ = goal.split()
+    if "=" not in pose:
+        step["pose"], goal = pose, goal.removeprefix(f"{pose} ")
     for key, value in (each.split("=", 1) for each in re.split(r"[ ](?=[a-z])|,(?=[a-z])", goal)):
         if key in ("xyz", "axis", "rpy", "quaternion"):
             step[key] = value if value.isalpha() else [float(number) for number in value.split(",")]
         elif key == "beyond_reach":
             step[key] = value
+        elif key in CONSTRAINT_KEYS:
+            numbers = [float(number) for number in value.split(",")] if value[-1].isdigit() else value
+            step.setdefault("path_constraints", {})[key] = numbers[0] if len(numbers) == 1 else numbers
         else:
             step.setdefault("joints", {})[key] = float(value)
     return step
@@ -140,8 +151,8 @@ def test_every_entrance_plans_the_same(run: Runtime, goal: str) -> None:
         else:
             np.testing.assert_allclose(other[0], answer[0], atol=2e-3)
             assert other[1] == pytest.approx(answer[1], abs=0.02)
-    assert not isinstance(answer, str) or "axis" in goal, (
-        "five joints do not reach every direction; all else is planned"
+    assert not isinstance(answer, str) or "axis=down" in goal or "axis=up" in goal or "upright=0.17" in goal, (
+        "five joints do not reach every direction, and the tool is not upright; all else is planned"
     )
 
 
@@ -158,5 +169,7 @@ def test_the_page_has_all_forms() -> None:
         "rpy=",
         "quaternion=",
         "gripper=",
+        "upright=",
+        "region=",
     ):
         assert any(word in each for each in goals), word

@@ -14,6 +14,7 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import Vector, ns, seconds
+from ibrobot_kinematics.constraints import ToolConstraints
 from ibrobot_kinematics.model import KinematicModel, TipPose
 from ibrobot_kinematics.servo_options import ServoOptions
 
@@ -33,6 +34,16 @@ _LONGEST_TICK_S = 0.1
 _VELOCITY, _ACCELERATION = 0.95, 0.85
 """Shares of the joints' limits that are used. The times of the steps jitter, and a setpoint beyond a limit would lag
 behind and then overshoot."""
+_APPROACH_S = 0.15
+"""Least time constant with which the tool approaches the bound of a path constraint [s]."""
+_BRAKING = 1.5
+"""The same, as a multiple of the time in which the joints stop."""
+_STOPPING = np.array([0.33, 0.67, 1.0])
+"""Parts of the way to a stop at which constraints are checked."""
+_RESERVE = 0.25
+"""Share of a constraint's `insides` that stays free at a stop, for the jitter of the steps."""
+_BOUND_WEIGHT = 1e4
+"""Weight of the bound of a constraint, against that of the twist."""
 _DEFAULTS = ServoOptions()
 
 
@@ -47,7 +58,7 @@ class ServoStatus(IntEnum):
     DECELERATE_FOR_COLLISION = 3
     HALT_FOR_COLLISION = 4
     JOINT_BOUND = 5
-    """A joint is near its limit, or the tool at the edge of its reach."""
+    """A joint is near its limit, or the tool at the edge of its reach, or at the bound of a path constraint."""
     DECELERATE_FOR_LEAVING_SINGULARITY = 6
 
 
@@ -65,6 +76,8 @@ class Servo:
     The tip follows the newest twist as well as the arm can. If it cannot, e.g. at the edge of its reach, it slows down
     and stops. Positions, speeds and accelerations of joints stay within their limits; a joint beyond its limit only
     moves inwards. Without a new twist in time, the arm slows down to a stop. The caller passes the time to each step.
+    Near the bound of a path constraint, the tool slows down towards it, and slides along; beyond it, it only moves
+    back.
 
     Args:
         model: the arm.
@@ -104,6 +117,9 @@ class Servo:
         # From full speed, a joint stops within the margin, unless its acceleration is too low.
         braking = self._max_velocity**2 / (2 * options.joint_limit_margin)
         self._braking = np.minimum(braking, self._max_acceleration)
+        stopping = float((self._max_velocity / self._max_acceleration).max())
+        self._approach_s = max(_APPROACH_S, _BRAKING * stopping)
+        self._constraints: ToolConstraints | None = None
         self._weights = np.concatenate([np.ones(3), _LEVER_M * np.asarray(turn_weights, dtype=float)])
         self.refused: Counter[str] = Counter()
         self.reset((model.lower + model.upper) / 2)
@@ -112,7 +128,8 @@ class Servo:
         """Rest at a position, and drop the twist.
 
         Args:
-            position: joint positions [rad or m], shape (J,).
+            position: joint positions [rad or m], shape (J,); they decide the `upright_axis` of path constraints that
+                do not give it.
 
         Raises:
             ValueError: if it is not finite or has another shape.
@@ -123,6 +140,8 @@ class Servo:
             )
         self.position = np.array(position, dtype=float)
         self.velocity = np.zeros_like(self.position)
+        if self._options.path_constraints is not None:
+            self._constraints = ToolConstraints(self._options.path_constraints, self._model, self.position)
         self._state = ServoStatus.NO_WARNING
         self._is_invalid = False
         self._twist: _Twist | None = None
@@ -205,6 +224,9 @@ class Servo:
         share = min(1.0, float(np.min(most / np.maximum(np.abs(change), 1e-12))))
         after = np.clip(before + share * change, lowest, highest)
         after = np.clip(after, before - most, before + most)
+        if self._constraints is not None and not self._stops_within(self._constraints, after, dt):
+            after = before - before * min(1.0, float(np.min(most / np.maximum(np.abs(before), 1e-12))))
+            self._state = ServoStatus.JOINT_BOUND
         self.velocity[moving] = after
         self.position[moving] += after * dt
         return self.position.copy()
@@ -259,12 +281,48 @@ class Servo:
         near_limit |= (wanted >= highest) & (highest < self._max_velocity)
         if scale < 1 or near_limit.any():
             self._state = ServoStatus.JOINT_BOUND
+        if self._constraints is not None:
+            wanted = self._constrained(self._constraints, wanted, hessian, slower * gradient, lowest, highest)
         ahead = self.position.copy()
         ahead[moving] += wanted * _LOOK_AHEAD_S
         scale *= self._scale_for_singularity(jacobian, ahead)
         if self._clearance is not None:
             scale *= self._scale_for_obstacles(self._clearance, ahead)
         return scale * wanted
+
+    def _constrained(
+        self, constraints: ToolConstraints, wanted: Vector, hessian: Vector, gradient: Vector, lowest: Vector,
+        highest: Vector,
+    ) -> Vector:  # fmt: skip
+        """Joint speeds near the wanted ones that approach no constraint faster than the room to its bound allows."""
+        excess, rates = constraints.excess_and_rates(self.position)
+        most = np.maximum(-(excess + constraints.insides), 0.0) / self._approach_s
+        held = np.zeros(len(most), dtype=bool)
+        while True:
+            over = np.where(held, 0.0, rates @ wanted - most)
+            if not over.max() > _AT_REST:
+                break
+            self._state = ServoStatus.JOINT_BOUND
+            held[int(over.argmax())] = True
+            rows = rates[held]
+            wanted = bounded_minimum(
+                hessian + _BOUND_WEIGHT * rows.T @ rows, gradient - _BOUND_WEIGHT * most[held] @ rows, lowest, highest
+            )
+        # What remains for a bound is little, and scaling all speeds alike keeps all other bounds.
+        towards = rates @ wanted
+        return wanted * float(np.min(np.where(towards > most, most / np.maximum(towards, 1e-12), 1.0)))
+
+    def _stops_within(self, constraints: ToolConstraints, velocity: Vector, dt: float) -> bool:
+        """Whether the arm, if it brakes after a tick at a velocity [rad/s], shape (n,), stops within all bounds.
+
+        The way to the stop is straight, since all joints brake in proportion. An arm that brakes stays on the way that
+        this check accepted a tick before.
+        """
+        stopping = dt + float(np.max(np.abs(velocity) / self._max_acceleration)) / 2
+        way = np.repeat(self.position[None], len(_STOPPING) + 1, axis=0)
+        way[1:, self._model.moving] += np.multiply.outer(_STOPPING * (dt + stopping), velocity)
+        here, *ahead = constraints.excess(way)
+        return bool((ahead <= np.maximum(here, -_RESERVE * constraints.insides)).all())
 
     def _scale_for_singularity(self, jacobian: Vector, ahead: Vector) -> float:
         options = self._options

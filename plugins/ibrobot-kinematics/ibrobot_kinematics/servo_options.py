@@ -5,6 +5,7 @@ from __future__ import annotations
 import attrs
 
 from ibrobot_core.api import Options, documented, option
+from ibrobot_kinematics.path_constraints import PathConstraints
 
 
 @documented
@@ -24,6 +25,9 @@ class ServoOptions(Options):
     )
     slow_distance: float = option(0.05, unit="m", gt=0, help="distance from an obstacle from which the tool slows down")
     stop_distance: float = option(0.01, unit="m", ge=0, help="distance from an obstacle at which it stops")
+    path_constraints: PathConstraints | None = option(
+        None, help="what holds while the tool moves, e.g. {upright: 0.17}: near a bound it slows down, and slides along"
+    )
 
     def __attrs_post_init__(self) -> None:
         for low, high in (

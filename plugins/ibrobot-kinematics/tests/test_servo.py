@@ -9,9 +9,17 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
-from ibrobot_kinematics import KinematicModel, Servo, ServoOptions, ServoStatus, read_mjcf
+from ibrobot_kinematics import (
+    KinematicModel,
+    PathConstraints,
+    Servo,
+    ServoOptions,
+    ServoStatus,
+    ToolConstraints,
+    read_mjcf,
+)
 from ibrobot_kinematics.rotations import log
 
 from ibrobot_core.api import Vector, ns
@@ -292,7 +300,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("options", "message"), BAD)
-def test_options_that_make_no_sense_are_refused(options: dict[str, float], message: str):
+def test_options_that_make_no_sense_are_refused(options: dict[str, Any], message: str):
     with pytest.raises(ValueError, match=message):
         ServoOptions(**options)
 
@@ -314,3 +322,87 @@ def test_limits_that_make_no_sense_are_refused(limits, message):
 def test_no_arm_stands_at_a_position_that_makes_no_sense(position):
     with pytest.raises(ValueError, match=r"position must be finite with shape \(6,\)"):
         Rig(ARMS[len(FIVE)]).servo.reset(position)
+
+
+def level(model: KinematicModel) -> Vector:
+    """As `bent`, with the tool level."""
+    q = bent(model)
+    q[[model.joint_names.index(name) for name in ("roll", "flex")]] = 0.0, -q[1] - q[2]
+    return q
+
+
+def constrained(model: KinematicModel, **values: Any) -> tuple[Rig, ToolConstraints]:
+    given_ = PathConstraints(**values)
+    start = level(model)
+    return Rig(model, ServoOptions(path_constraints=given_), start=start), ToolConstraints(given_, model, start)
+
+
+def region(model: KinematicModel, room: float = 0.04) -> tuple[float, ...]:
+    here = model.forward(level(model)).position
+    return (*(here - room).tolist(), *(here + room).tolist())
+
+
+@settings(deadline=None, max_examples=15, phases=[Phase.explicit, Phase.generate])
+@given(orders=st.lists(commands, min_size=1, max_size=6), kind=st.sampled_from(["upright", "region", "view", "all"]))
+def test_no_twist_breaks_a_path_constraint_or_a_limit(orders, kind):
+    for model in ARMS.values():
+        ahead = model.forward(level(model))
+        values: dict[str, Any] = {}
+        if kind in ("upright", "all"):
+            values["upright"] = 0.17
+        if kind in ("region", "all"):
+            values["region"] = region(model)
+        if kind in ("view", "all"):
+            values |= {"view": tuple((ahead.position + 0.3 * ahead.rotation[:, 2]).tolist()), "view_angle": 0.2}
+        rig, tool = constrained(model, **values)
+        for linear, turn, in_tool, seconds in orders:
+            rig.follow(linear, turn, seconds, in_tool=in_tool)
+            for _ in range(int(100 * seconds) % 20):
+                rig.tick()
+        rig.rest()
+        rig.tick()
+        rig.tick()
+        excess = tool.excess(np.array(rig.positions)).max(axis=0)
+        assert (excess <= 0).all(), f"{kind}: {excess}"
+        assert_within_limits(rig, model.lower, model.upper)
+
+
+def test_tool_slows_down_before_the_bound_and_comes_back(model):
+    rig, _ = constrained(model, region=region(model))
+    start = rig.positions[-1]
+    upwards, speeds = np.array([0, 0, 0.2]), []
+    for _ in range(100):
+        before = rig.positions[-1]
+        speeds.append(moved(model, before, rig.follow(upwards))[2] / DT)
+    top = region(model)[5]
+    assert 0.8 * 0.04 < moved(model, start, rig.positions[-1])[2] < 0.04
+    assert max(speeds) > 0.1
+    assert 0 <= speeds[-1] < 0.002, "it creeps at the bound"
+    statuses = [rig.servo.status]
+    assert model.forward(rig.follow(-upwards, seconds=0.2)).position[2] < top - 0.01
+    statuses.append(rig.servo.status)
+    assert statuses == [ServoStatus.JOINT_BOUND, ServoStatus.NO_WARNING]
+
+
+def test_tool_slides_along_a_bound(model):
+    rig, _ = constrained(model, region=region(model))
+    rig.follow(np.array([0, 0, 0.2]), seconds=1.0)
+    before = rig.positions[-1]
+    way = moved(model, before, rig.follow(np.array([0, 0.1, 0.1]), seconds=0.2))
+    assert way[1] > 0.008
+    assert 0 <= way[2] < 0.002
+
+
+def test_tool_that_starts_beyond_a_bound_only_moves_back(model):
+    rig, _ = constrained(model, upright=0.1, upright_axis="-x")
+    tilted = level(model)
+    tilted[model.joint_names.index("flex")] += 0.3
+    rig.servo.reset(tilted)
+    tool = ToolConstraints(PathConstraints(upright=0.1, upright_axis="-x"), model, tilted)
+    rig.follow(STILL, np.array([0, 1.0, 0]), 0.3)
+    rig.follow(STILL, np.array([0, -1.0, 0]), 0.6)
+    rig.follow(STILL, np.array([0, 1.0, 0]), 0.3)
+    excess = tool.excess(np.array(rig.positions[1:]))[:, 0]
+    assert excess[0] > 0.1
+    assert (np.diff(excess)[excess[:-1] > 0] <= 1e-9).all()
+    assert excess[-1] < 0

@@ -11,6 +11,8 @@ import attrs
 from ibrobot_core.api import Descriptor
 
 if TYPE_CHECKING:
+    from ibrobot_kinematics import PathConstraints
+
     from ibrobot_core.api import JointTrajectory, Pose, Vector, Vector3
 
 OrientationPolicy = Literal["refuse", "nearest", "keep_axis", "arm_plane", "current", "free"]
@@ -64,13 +66,6 @@ class PoseGoal:
 
 
 @attrs.frozen
-class AnyGoal:
-    """Alternative goals: the planner uses the first one that it can reach."""
-
-    goals: tuple[JointGoal | NamedGoal | PositionGoal | PoseGoal, ...]
-
-
-@attrs.frozen
 class LinearGoal:
     """A path of the tool centre point along straight lines through waypoints, from its present pose."""
 
@@ -79,7 +74,27 @@ class LinearGoal:
     """Fraction of the path's length that must be possible, in (0, 1]."""
 
 
-type Goal = JointGoal | NamedGoal | PositionGoal | PoseGoal | AnyGoal | LinearGoal
+@attrs.frozen(eq=False)
+class ConstrainedGoal:
+    """A goal whose whole way keeps path constraints. A goal of its own, so that no planner overlooks them."""
+
+    goal: JointGoal | NamedGoal | PositionGoal | PoseGoal | LinearGoal
+    constraints: PathConstraints
+
+
+@attrs.frozen
+class AnyGoal:
+    """Alternative goals: the planner uses the first one that it can reach."""
+
+    goals: tuple[JointGoal | NamedGoal | PositionGoal | PoseGoal | ConstrainedGoal, ...]
+
+
+type Goal = JointGoal | NamedGoal | PositionGoal | PoseGoal | AnyGoal | LinearGoal | ConstrainedGoal
+
+
+def constrains(goal: Goal | None) -> bool:
+    """Whether a goal, or one of its alternatives, has path constraints."""
+    return isinstance(goal, ConstrainedGoal) or (isinstance(goal, AnyGoal) and any(map(constrains, goal.goals)))
 
 
 @attrs.frozen(eq=False)

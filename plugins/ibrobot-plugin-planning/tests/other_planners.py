@@ -94,7 +94,9 @@ class BatchPlanner(Planner):
                 outside = (end < robot.lower[order]) | (end > robot.upper[order]) | ~np.isfinite(end)
                 if outside.any():
                     joint = request.joints[int(outside.argmax())]
-                    raise PlanningError(f"goal of joint {joint} is outside its limits", PlanCode.GOAL_STATE_INVALID)
+                    raise PlanningError(
+                        f"goal of joint {joint} is outside its limits", PlanCode.INVALID_GOAL_CONSTRAINTS
+                    )
                 yield end
             case PositionGoal(position=p) | PoseGoal(pose=Pose(position=p)):
                 whole = np.zeros(len(robot.joints))

@@ -72,7 +72,8 @@ NAMES = ", ".join(JOINTS)
         ("pan=1,pan=2", "pan is given twice"),
         (
             "0.5 pan=1",
-            "'0.5' is neither a joint nor xyz, axis, rpy, quaternion, beyond_reach, each followed by = and its value",
+            "'0.5' is neither a joint nor xyz, axis, rpy, quaternion, upright, upright_axis, region, view, view_angle,"
+            " view_axis, view_from, beyond_reach, each followed by = and its value",
         ),
         ("xyz=0.2,0.1", "xyz takes 3 numbers, got 2"),
         ("xyz=0.2,0.1,high", "xyz: 'high' is not a finite number"),

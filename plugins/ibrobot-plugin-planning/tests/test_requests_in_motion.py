@@ -132,7 +132,7 @@ def test_goal_whose_motion_is_refused_when_it_blends_fails_alone(run: Run, monke
     """For example by an emergency stop at that moment."""
     runtime, number = moving(run)
 
-    def follow(self: Execution, goals: Any) -> None:
+    def follow(self: Execution, goals: Any, *, blends: bool) -> None:
         raise HardwareError("refused, the robot is stopping")
 
     with monkeypatch.context() as patch:
@@ -143,6 +143,20 @@ def test_goal_whose_motion_is_refused_when_it_blends_fails_alone(run: Run, monke
     assert ended is not None
     assert ended.outcome == "CANCELLED"
     assert finish(runtime, runtime.session.bus.call(GO_TO, "up")).success
+
+
+@pytest.mark.parametrize(("constraint", "blends"), [("", True), (" region=-1,-1,-1,1,1,1", False)])
+def test_motion_with_constraints_begins_once_the_arm_rests(run: Run, constraint: str, blends: bool):
+    """A blend would leave the path that was checked for them."""
+    runtime, _ = moving(run)
+    number = runtime.session.bus.call(GO_TO, f"right{constraint}")
+    commands = [command(runtime)]
+    while (result := runtime.session.bus.call(RESULT, number)) is None:
+        assert not runtime.step()
+        commands.append(command(runtime))
+    assert result.success, result
+    moves = np.flatnonzero(np.abs(np.diff(commands, axis=0)).max(axis=1) > 1e-6)
+    assert (len(moves) == moves[-1] - moves[0] + 1) == blends
 
 
 def test_bug_of_a_planner_fails_its_goal_alone(start: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -37,7 +37,7 @@ from ibrobot_core.app import (
 )
 from ibrobot_planning.execution.plans import GoalPlans, arm_joints
 from ibrobot_planning.goals.text import Target, target
-from ibrobot_planning.planner import PoseGoal, PositionGoal
+from ibrobot_planning.planner import ConstrainedGoal, PoseGoal, PositionGoal
 from ibrobot_planning.planners.search import length
 from ibrobot_planning.planners.timing import motion_of
 from ibrobot_planning.world.objects import world_of
@@ -145,11 +145,16 @@ def _positions(text: str, robot: Robot) -> Vector:
 
 
 def _kind(aim: Target) -> str:
-    if isinstance(aim.tool, PositionGoal):
-        return "position" if aim.tool.axis is None else "position with axis"
-    if isinstance(aim.tool, PoseGoal):
-        return "pose"
-    return "joints" if "=" in aim.text else "named pose"
+    tool, constraints = aim.tool, aim.constraints
+    if isinstance(tool, ConstrainedGoal):
+        constraints = tool.constraints
+        tool = tool.goal
+    kept = "" if constraints is None else f", {constraints.text} on the whole way"
+    if isinstance(tool, PositionGoal):
+        return ("position" if tool.axis is None else "position with axis") + kept
+    if isinstance(tool, PoseGoal):
+        return f"pose{kept}"
+    return ("joints" if "=" in aim.text.partition(" ")[0] else "named pose") + kept
 
 
 def _planned(

@@ -162,11 +162,16 @@ class Execution:
             self._number, self._stops = number, stops
             return rest
 
-    def follow(self, goals: Mapping[str, ExecutorGoal]) -> None:
-        """Add the next motion to the braking one."""
+    def follow(self, goals: Mapping[str, ExecutorGoal], *, blends: bool) -> None:
+        """Add the next motion to the braking one.
+
+        Args:
+            goals: executor -> its goal.
+            blends: whether it may begin before the arm rests: a blend leaves the path, and path constraints with it.
+        """
         with self._lock:
             self._ahead = {
-                name: _Next(goal, motion_of(goal.trajectory) if isinstance(goal, FollowTrajectory) else None)
+                name: _Next(goal, motion_of(goal.trajectory) if blends and isinstance(goal, FollowTrajectory) else None)
                 for name, goal in goals.items()
             }
         self.step()

@@ -27,7 +27,16 @@ from ibrobot_planning.goals.grammar import GoalOptions
 from ibrobot_planning.goals.joints import without_names
 from ibrobot_planning.goals.text import Target
 from ibrobot_planning.goals.tool import Tool
-from ibrobot_planning.planner import AnyGoal, Goal, JointGoal, Planner, PlannerDescriptor, PlanRequest, PlanResult
+from ibrobot_planning.planner import (
+    AnyGoal,
+    ConstrainedGoal,
+    Goal,
+    JointGoal,
+    Planner,
+    PlannerDescriptor,
+    PlanRequest,
+    PlanResult,
+)
 from ibrobot_planning.planners.completion import Start, check_size, completed
 from ibrobot_planning.world.objects import World, world_of
 
@@ -102,7 +111,7 @@ class GoalPlans:
         """
         takes = tool_planners(self._session.registry)
         assert self._mode.planner is not None
-        of_tool = target.tool is not None and not isinstance(target.tool, JointGoal)
+        of_tool = target.constraints is not None or not isinstance(target.tool, JointGoal | None)
         if of_tool and self._mode.planner.type not in takes:
             raise PlanningError(
                 f"goal {target.text!r}: planner type {self._mode.planner.type!r} of mode {self._mode.name} takes joint"
@@ -136,7 +145,8 @@ class GoalPlans:
             if mine and executor.goals == "position":
                 parts[name] = target.joints[mine[0]]
             elif mine:
-                parts[name] = JointGoal(tuple(mine), np.array([target.joints[joint] for joint in mine]))
+                goal = JointGoal(tuple(mine), np.array([target.joints[joint] for joint in mine]))
+                parts[name] = goal if target.constraints is None else ConstrainedGoal(goal, target.constraints)
         if target.tool is None:
             return parts
         arms = [name for name, executor in executors.items() if executor.goals == "trajectory"]

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import attrs
+from ibrobot_kinematics import PathConstraints
 
 from ibrobot_core.api import (
     Header,
@@ -19,7 +20,7 @@ from ibrobot_core.api import (
     option,
 )
 from ibrobot_core.app import PlanCode
-from ibrobot_planning.goals.grammar import LEAST_SCALING, GoalOptions
+from ibrobot_planning.goals.grammar import LEAST_SCALING, GoalOptions, check_waypoints
 from ibrobot_planning.goals.text import Target
 from ibrobot_planning.planner import Goal
 from ibrobot_planning.world.ages import AgeSummary
@@ -126,6 +127,10 @@ class CartesianQuery:
     start: Mapping[str, float] = option(factory=dict, unit="rad", help="start; other joints: the present position")
     velocity_scaling: float = _scaling("velocity")
     acceleration_scaling: float = _scaling("acceleration")
+    path_constraints: PathConstraints | None = option(None, help="what holds on the whole line, e.g. {upright: 0.17}")
+
+    def __attrs_post_init__(self) -> None:
+        check_waypoints(self.waypoints)
 
 
 @documented

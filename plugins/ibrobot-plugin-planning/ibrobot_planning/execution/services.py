@@ -113,7 +113,8 @@ class PlanningServices:
 
     def _cartesian(self, query: CartesianQuery) -> PlanAnswer:
         def goal(start: Vector) -> Goal:
-            return line_goal(query.waypoints, query.least_fraction, *self._plans.surroundings(query.waypoints, start))
+            place = self._plans.surroundings(query.waypoints, start)
+            return line_goal(query.waypoints, query.least_fraction, query.path_constraints, *place)
 
         return self._planned(goal, query)
 

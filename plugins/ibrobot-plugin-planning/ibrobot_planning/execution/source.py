@@ -33,7 +33,15 @@ from ibrobot_planning.execution.services import PlanningServices
 from ibrobot_planning.goals.grammar import check_frame
 from ibrobot_planning.goals.text import Target, target
 from ibrobot_planning.goals.tool import pose_matrix
-from ibrobot_planning.planner import AnyGoal, Goal, JointGoal, OrientationPolicy, PlanResult, PoseGoal
+from ibrobot_planning.planner import (
+    AnyGoal,
+    Goal,
+    JointGoal,
+    OrientationPolicy,
+    PlanResult,
+    PoseGoal,
+    constrains,
+)
 from ibrobot_planning.world.objects import observed_world
 
 RESULT: Service[Numbered, MoveResult | None] = Service(
@@ -431,7 +439,8 @@ class PlannerSource(SourceWorker):
             self._finish(new, _outcome(error), error.code, str(error))
             return True
         if not new.blocked:
-            self._following(new, lambda: self._execution.follow(goals))
+            blends = new.target.constraints is None and not constrains(new.target.tool)
+            self._following(new, lambda: self._execution.follow(goals, blends=blends))
         return True
 
     def _following(self, move: _Move, step: Callable[[], None]) -> None:

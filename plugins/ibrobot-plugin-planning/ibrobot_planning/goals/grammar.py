@@ -8,13 +8,22 @@ from typing import Literal, get_args
 
 import attrs
 import numpy as np
+from ibrobot_kinematics import PathConstraints
 from ibrobot_kinematics.poses import homogeneous, matrix, pose
 from ibrobot_kinematics.rotations import from_quaternion, from_rpy
 
 from ibrobot_core.api import PlanningError, Pose, Vector, Vector3, documented, option
 from ibrobot_core.app import PlanCode
 from ibrobot_planning.goals.errors import invalid_goal
-from ibrobot_planning.planner import JointGoal, LinearGoal, NamedGoal, OrientationPolicy, PoseGoal, PositionGoal
+from ibrobot_planning.planner import (
+    ConstrainedGoal,
+    JointGoal,
+    LinearGoal,
+    NamedGoal,
+    OrientationPolicy,
+    PoseGoal,
+    PositionGoal,
+)
 from ibrobot_planning.world.objects import BASE_FRAMES, World
 from ibrobot_planning.world.options import FURTHEST
 
@@ -66,6 +75,7 @@ class GoalOptions:
     joint_tolerance: float = option(0.0, unit="rad", ge=0, help="allowed deviation if the joints' goal is blocked")
     position_tolerance: float = option(0.001, unit="m", gt=0, help="allowed distance from the position")
     angle_tolerance: float = option(0.01, unit="rad", gt=0, help="allowed angle from the axis or orientation")
+    path_constraints: PathConstraints | None = option(None, help="what holds on the whole way, e.g. {upright: 0.17}")
 
     def __attrs_post_init__(self) -> None:
         exactly_one("a goal", self.kinds())
@@ -103,16 +113,19 @@ class GoalOptions:
     @property
     def text(self) -> str:
         """The goal in a few words."""
+        kept = "" if self.path_constraints is None else f" {self.path_constraints.text}"
         if self.pose is not None:
-            return self.pose
+            return f"{self.pose}{kept}"
         if self.joints:
-            return ", ".join(f"{joint}={value:g}" for joint, value in self.joints.items())
+            return ", ".join(f"{joint}={value:g}" for joint, value in self.joints.items()) + kept
         where = ", ".join(f"{value:g}" for value in self.xyz or (0.0, 0.0, 0.0))
         of = " from here" if self.relative else f" from {self.object}" if self.object is not None else ""
-        return f"({where}) m{of}"
+        return f"({where}) m{of}{kept}"
 
-    def goal(self, world: World, tool: Vector | None = None) -> JointGoal | NamedGoal | PositionGoal | PoseGoal:
-        """The goal, in the form that planners take.
+    def goal(
+        self, world: World, tool: Vector | None = None
+    ) -> JointGoal | NamedGoal | PositionGoal | PoseGoal | ConstrainedGoal:
+        """The goal, in the form that planners take, with its path constraints.
 
         Args:
             world: the objects that it may refer to.
@@ -121,14 +134,17 @@ class GoalOptions:
         Raises:
             PlanningError: for an unknown object, or a relative goal without a position of the tool.
         """
+        goal: JointGoal | NamedGoal | PositionGoal | PoseGoal
         if self.pose is not None:
-            return NamedGoal(self.pose)
-        if self.joints:
-            return JointGoal(tuple(self.joints), np.array(list(self.joints.values())), self.joint_tolerance)
-        return self.tool_goal(world, tool)
+            goal = NamedGoal(self.pose)
+        elif self.joints:
+            goal = JointGoal(tuple(self.joints), np.array(list(self.joints.values())), self.joint_tolerance)
+        else:
+            goal = self.tool_goal(world, tool)
+        return goal if self.path_constraints is None else ConstrainedGoal(goal, self.path_constraints)
 
     def tool_goal(self, world: World, tool: Vector | None = None) -> PositionGoal | PoseGoal:
-        """The position or pose of the tool; arguments and errors are those of `goal`.
+        """The position or pose of the tool, without constraints; arguments and errors are those of `goal`.
 
         Raises:
             PlanningError: also for other kinds of goals.
@@ -153,16 +169,31 @@ class GoalOptions:
 
 
 def line_goal(
-    waypoints: Sequence[GoalOptions], least_fraction: float, world: World, tool: Vector | None = None
-) -> LinearGoal:
-    """Straight lines of the tool through waypoints.
+    waypoints: Sequence[GoalOptions], least_fraction: float, constraints: PathConstraints | None,
+    world: World, tool: Vector | None = None,
+) -> LinearGoal | ConstrainedGoal:  # fmt: skip
+    """Straight lines of the tool through waypoints, with path constraints for all of them.
 
     Raises:
         PlanningError: without waypoints, or as `GoalOptions.tool_goal`.
     """
     if not waypoints:
         raise invalid_goal("a straight path needs at least one waypoint")
-    return LinearGoal(tuple(each.tool_goal(world, tool) for each in waypoints), least_fraction)
+    line = LinearGoal(tuple(each.tool_goal(world, tool) for each in waypoints), least_fraction)
+    return line if constraints is None else ConstrainedGoal(line, constraints)
+
+
+def check_waypoints(waypoints: Sequence[GoalOptions]) -> None:
+    """Check that waypoints are positions, and leave path constraints to their line.
+
+    Raises:
+        ValueError: for the first that is not, or does not.
+    """
+    for i, each in enumerate(waypoints):
+        if not each.of_tool:
+            raise ValueError(f"line.{i}: a straight line goes to a position: xyz or object")
+        if each.path_constraints is not None:
+            raise ValueError(f"line.{i}: path_constraints hold on the whole line: give them beside it")
 
 
 def upright(thing: Pose) -> Vector:

@@ -13,7 +13,7 @@ from ibrobot_core.api import PlanningError, Robot, Vector
 from ibrobot_core.app import PlanCode
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.grammar import scaling_fault
-from ibrobot_planning.planner import AnyGoal, Goal, JointGoal, NamedGoal, PlanRequest
+from ibrobot_planning.planner import AnyGoal, ConstrainedGoal, Goal, JointGoal, NamedGoal, PlanRequest
 
 
 def pose_names(robot: Robot) -> list[str]:
@@ -65,6 +65,8 @@ def without_names(goal: Goal, robot: Robot, joints: Sequence[str]) -> Goal:
     """
     if isinstance(goal, AnyGoal):
         return AnyGoal(tuple(without_names(each, robot, joints) for each in goal.goals))  # type: ignore[misc]
+    if isinstance(goal, ConstrainedGoal):
+        return ConstrainedGoal(without_names(goal.goal, robot, joints), goal.constraints)  # type: ignore[arg-type]
     if not isinstance(goal, NamedGoal):
         return goal
     positions = {joint: value for joint, value in named_pose(robot, goal.name).items() if joint in joints}

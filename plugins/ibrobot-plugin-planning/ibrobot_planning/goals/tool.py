@@ -8,10 +8,18 @@ from contextlib import suppress
 
 import attrs
 import numpy as np
-from ibrobot_kinematics import KinematicModel, Target, TipPose, UnreachableError, solve, solve_all
+from ibrobot_kinematics import (
+    KinematicModel,
+    Target,
+    TipPose,
+    ToolConstraints,
+    UnreachableError,
+    solve,
+    solve_all,
+)
 from ibrobot_kinematics.poses import matrix
 from ibrobot_kinematics.rotations import between, cross, log
-from ibrobot_kinematics.search import search
+from ibrobot_kinematics.search import TABLE_LEVER_M, search, starts_from_table
 
 from ibrobot_core.api import Vector, Vector3
 from ibrobot_planning.goals.errors import invalid_goal, unreachable
@@ -31,6 +39,8 @@ _FAR = 10.0
 """Positions farther than this many times the arm's reach are refused at once."""
 _WIDEST = 100.0
 """Larger tolerances [m or rad] are refused."""
+_NEAR_POSITION, _SEEDS = 400, 60
+"""Configurations near a position, and how many of them, the nearest to constraints, are projected onto these."""
 _NEARLY_ONE = 1e-3
 """How far from 1 the length of a quaternion may be."""
 
@@ -127,6 +137,33 @@ class Tool:
         candidates = self._posed(position, rotation, start, goal.position_tolerance)
         met = [each for each in candidates if each.orientation_error <= goal.orientation_tolerance]
         return met or self._beyond(goal, position, rotation, start, candidates)
+
+    def keeping(
+        self, goal: PositionGoal | PoseGoal, near: Sequence[Candidate], constraints: ToolConstraints, start: Vector
+    ) -> list[Candidate]:
+        """Configurations at the position of a goal that keep path constraints, the nearest to `start` first.
+
+        Args:
+            goal: the goal; one with an orientation has none besides `near`.
+            near: configurations that reach it.
+            constraints: the constraints.
+            start: positions of all joints of the model [rad], shape (J,).
+        """
+        if isinstance(goal, PositionGoal):
+            position, axis = vector(goal.position, "the position"), None if goal.axis is None else unit(goal.axis)
+        elif goal.orientation_tolerance is None or goal.beyond_reach == "free":
+            position, axis = pose_matrix(goal)[:3, 3], None
+        else:
+            return []
+        target = Target(position, axis=axis)
+        lever = 0.0 if axis is None else TABLE_LEVER_M
+        table = starts_from_table(self.model, target, start, _NEAR_POSITION, lever=lever)
+        nearest = np.argsort(constraints.excess(table).max(axis=1), kind="stable")[:_SEEDS]
+        seeds = np.concatenate([np.array([each.joints for each in near]), table[nearest]])
+        reached, done = constraints.projected(np.clip(seeds, self.model.lower, self.model.upper), target)
+        reached = reached[done]
+        ranked = reached[np.argsort(((reached - start) ** 2).sum(axis=1), kind="stable")]
+        return [self._compared(q, position, None, axis) for q in _distinct(list(ranked))]
 
     def check_reach(self, position: Vector, start: Vector) -> None:
         """Refuse a position [m], shape (3,), so far away that numbers would overflow or lines never end.

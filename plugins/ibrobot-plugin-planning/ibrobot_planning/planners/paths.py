@@ -39,6 +39,16 @@ class Margins(Protocol):
         """Height of the floor in the base frame [m]; everything below is blocked. None: that of the description."""
 
 
+class ContactChecks(Protocol):
+    """The part of a collision checker that looks at single configurations."""
+
+    def free(self, q: Vector) -> bool:
+        """Whether `q`, shape (J,), is free."""
+
+    def contacts(self, q: Vector) -> list[Contact]:
+        """Contacts closer than their padding at `q`, shape (J,)."""
+
+
 class FreePaths:
     """Whether trajectories are free in the present world. Methods may be called from several threads.
 
@@ -103,7 +113,7 @@ def collisions(
     return Collisions(arm, world, joints, others, padding=margins.padding, self_padding=margins.self_padding)
 
 
-def outwards(checks: Collisions, configurations: Vector) -> int | None:
+def outwards(checks: ContactChecks, configurations: Vector) -> int | None:
     """Number of configurations before the first free one, while distances grow; None if one shrinks."""
     before = {(each.first, each.second): each.distance for each in checks.contacts(configurations[0])}
     for number, q in enumerate(configurations):

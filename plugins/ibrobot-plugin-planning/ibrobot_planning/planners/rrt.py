@@ -9,7 +9,7 @@ from typing import override
 
 import attrs
 import numpy as np
-from ibrobot_kinematics import robot_model
+from ibrobot_kinematics import ToolConstraints, robot_model
 
 from ibrobot_core.api import Context, JointTrajectory, PlanningError, Vector
 from ibrobot_core.app import PlanCode
@@ -18,6 +18,7 @@ from ibrobot_planning.goals.joints import checked_start, joint_target
 from ibrobot_planning.goals.tool import Candidate, Tool
 from ibrobot_planning.planner import (
     AnyGoal,
+    ConstrainedGoal,
     Goal,
     JointGoal,
     LinearGoal,
@@ -28,6 +29,7 @@ from ibrobot_planning.planner import (
     PoseGoal,
     PositionGoal,
 )
+from ibrobot_planning.planners.constrained import ROUNDING, ConstrainedChecks, ConstrainedSpace
 from ibrobot_planning.planners.linear import linear_path
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.paths import CHECK_S, FreePaths, collisions, outwards, sentence
@@ -122,11 +124,15 @@ class _Plan:
     tool: Tool
     request: PlanRequest
     start: Vector
-    checks: Collisions
+    checks: Collisions | ConstrainedChecks
     deadline: float
+    refused: Motion | None = None
+    """The last motion that broke a path constraint."""
 
     def solve(self) -> PlanResult:
         goal = self.request.goal
+        if isinstance(goal, ConstrainedGoal):
+            return self._constrained(goal).solve()
         if isinstance(goal, LinearGoal):
             return self._linear(goal)
         way_out = self._way_out()
@@ -163,7 +169,37 @@ class _Plan:
         whole[self._order] = self.start
         return whole
 
+    @property
+    def _constraints(self) -> ToolConstraints | None:
+        return self.checks.constraints if isinstance(self.checks, ConstrainedChecks) else None
+
+    def _constrained(self, goal: ConstrainedGoal) -> _Plan:
+        """The same request, with checks of path constraints.
+
+        Raises:
+            PlanningError: if the start breaks them.
+        """
+        self._check_chain()
+        assert isinstance(self.checks, Collisions)
+        constraints = ToolConstraints(goal.constraints, self.tool.model, self._whole())
+        checks = ConstrainedChecks(self.checks, constraints, self._whole(), self._order)
+        if broken := checks.broken(self.start):
+            raise PlanningError(f"the start breaks {broken}", PlanCode.START_STATE_VIOLATES_PATH_CONSTRAINTS)
+        return attrs.evolve(self, request=attrs.evolve(self.request, goal=goal.goal), checks=checks)
+
+    def _space(self, resolution: float) -> Space:
+        if isinstance(self.checks, ConstrainedChecks):
+            return ConstrainedSpace(self.checks, *self._limits, resolution, constrained=self.checks)
+        return Space(self.checks, *self._limits, resolution)
+
+    def _why(self, q: Vector) -> str:
+        """What a configuration that is not free breaks or touches, in words."""
+        broken = self.checks.broken(q) if isinstance(self.checks, ConstrainedChecks) else ""
+        return broken or sentence(self.checks.contacts(q))
+
     def _reach(self, goal: Goal, number: int, way_out: list[Vector], deadline: float) -> PlanResult:
+        if isinstance(goal, ConstrainedGoal):
+            return self._constrained(goal)._reach(goal.goal, number, way_out, deadline)
         candidates = self._free_goals(self._candidates(goal), goal)
         if np.abs(candidates[0].joints[self._order] - self.start).max() < _ROUNDING and len(way_out) == 1:
             return self._result(resting(self.start, self.options.step), candidates[0], number)
@@ -173,18 +209,33 @@ class _Plan:
             if motion is not None:
                 reached = next(i for i, each in enumerate(goals) if np.array_equal(each, path[-1]))
                 return self._result(motion, candidates[reached], number)
+        if self.refused is not None:
+            raise PlanningError(self._breach(self.refused), PlanCode.INVALID_MOTION_PLAN)
         raise PlanningError(self._stuck(way_out[-1], goals[0]), PlanCode.TIMED_OUT)
+
+    def _breach(self, motion: Motion) -> str:
+        """Where a motion breaks a path constraint."""
+        assert isinstance(self.checks, ConstrainedChecks)
+        positions, velocities, _ = motion.sampled(CHECK_S)
+        at = min(self.checks.first_broken(positions), len(positions) - 1)
+        whole, velocity = self.checks.whole(positions[at]), np.zeros(len(self.ctx.robot.joints))
+        velocity[self._order] = velocities[at]
+        joint = self.checks.constraints.moved_by(whole, velocity)
+        return (
+            f"every timed motion breaks a path constraint; the last at {at * CHECK_S:.3f} s, mostly by joint {joint}:"
+            f" {self.checks.broken(positions[at])}"
+        )
 
     def _paths(self, start: Vector, goals: list[Vector], deadline: float) -> Iterator[list[Vector]]:
         """Short paths with increasingly fine checks; the caller takes the next if the timed motion touches."""
         rng = np.random.default_rng(self.ctx.seed)
         for resolution in _RESOLUTIONS_M:
-            space = Space(self.checks, *self._limits, resolution)
+            space = self._space(resolution)
             path = connect(space, start, goals, rng, lambda: time.monotonic() > deadline)
             if path is None:
                 return
             for closely in _RESOLUTIONS_M[1:]:
-                yield shortened(Space(self.checks, *self._limits, closely), path, rng, self._pace)
+                yield shortened(self._space(closely), path, rng, self._pace)
 
     def _candidates(self, goal: Goal) -> list[Candidate]:
         robot = self.ctx.robot
@@ -216,6 +267,8 @@ class _Plan:
         Raises:
             PlanningError: if all of them touch something.
         """
+        if self._constraints is not None:
+            candidates = self._keeping(self._constraints, candidates, goal)
         free = [candidate for candidate in candidates if self.checks.free(candidate.joints[self._order])]
         if not free and isinstance(goal, JointGoal) and goal.tolerance > 0:
             free = self._nearby(candidates[0].joints, goal)
@@ -227,6 +280,24 @@ class _Plan:
         )
         at_all = f" in all of its {len(candidates)} configurations" if len(candidates) > 1 else ""
         raise PlanningError(f"the goal is in collision{at_all}: {sentence(least)}", PlanCode.GOAL_IN_COLLISION)
+
+    def _keeping(self, constraints: ToolConstraints, candidates: list[Candidate], goal: Goal) -> list[Candidate]:
+        """The configurations that keep the path constraints, and others at the same position.
+
+        Raises:
+            PlanningError: if there are none, with the least excess.
+        """
+        if isinstance(goal, PositionGoal | PoseGoal):
+            candidates = [*candidates, *self.tool.keeping(goal, candidates, constraints, self._whole())]
+        kept = [each for each in candidates if constraints.kept(each.joints, -ROUNDING)]
+        if kept or (isinstance(goal, JointGoal) and goal.tolerance > 0):
+            return kept or candidates
+        least = min(candidates, key=lambda each: float(constraints.excess(each.joints).max()))
+        nearest = "" if isinstance(goal, JointGoal | NamedGoal) else "; no configuration at the position keeps it"
+        raise PlanningError(
+            f"the goal breaks {constraints.broken(least.joints, -ROUNDING)}{nearest}",
+            PlanCode.GOAL_VIOLATES_PATH_CONSTRAINTS,
+        )
 
     def _nearby(self, whole: Vector, goal: JointGoal) -> list[Candidate]:
         """The nearest of random free configurations within the goal's tolerance."""
@@ -251,10 +322,14 @@ class _Plan:
         inside = np.clip(self.start, *self._limits)
         way = [self.start] if np.array_equal(inside, self.start) else [self.start, inside]
         touching = [contact for q in way if not self.checks.free(q) for contact in self.checks.contacts(q)]
-        if not touching and Space(self.checks, *self._limits, _FINEST_M).free(way[0], way[-1]):
+        if not touching and self._space(_FINEST_M).free(way[0], way[-1]):
             return way
         deepest = min(touching, key=lambda contact: contact.distance, default=None)
         if deepest is None or deepest.distance < -self.options.start_overlap:
+            if not touching and (broken := self._why(inside)):
+                raise PlanningError(
+                    f"the way back within the joints' limits is blocked: {broken}", PlanCode.START_STATE_INVALID
+                )
             raise PlanningError(f"the start is in collision: {sentence(touching)}", PlanCode.START_STATE_IN_COLLISION)
         rng = np.random.default_rng(self.ctx.seed)
         for distance in (0.03, 0.06, 0.1, 0.2, 0.4):
@@ -270,7 +345,7 @@ class _Plan:
 
     def _leaves(self, start: Vector, end: Vector) -> bool:
         """Whether contacts at the start only open on the line to a free end, and no other contact occurs."""
-        line = Space(self.checks, *self._limits, _FINEST_M).line(start, end)
+        line = self._space(_FINEST_M).line(start, end)
         return outwards(self.checks, np.concatenate([start[None], line])) is not None
 
     def _linear(self, goal: LinearGoal) -> PlanResult:
@@ -282,11 +357,11 @@ class _Plan:
             raise PlanningError(f"the start is in collision: {sentence(touching)}", PlanCode.START_STATE_IN_COLLISION)
         line = linear_path(self.tool, goal.waypoints, self._whole())
         path = line.joints[:, self._order]
-        space = Space(self.checks, *self._limits, _FINEST_M)
+        space = self._space(_FINEST_M)
         possible, reason = len(path), line.reason
         for number in range(1, len(path)):
             if not space.free(path[number - 1], path[number]):
-                possible, reason = number, sentence(self.checks.contacts(path[number]))
+                possible, reason = number, self._why(path[number])
                 break
         motion = None
         while possible > 1:
@@ -341,7 +416,7 @@ class _Plan:
     def _free_closely(self, way: Vector) -> bool:
         """Whether the path itself is free; if not, no blend helps."""
         begin = 0 if self.checks.free(way[0]) else 1
-        finest = Space(self.checks, *self._limits, _FINEST_M)
+        finest = self._space(_FINEST_M)
         return all(finest.free(a, b) for a, b in pairwise(way[begin:]))
 
     def _blends(self, way: Vector) -> Vector:
@@ -365,6 +440,8 @@ class _Plan:
     def _touching(self, motion: Motion) -> Vector:
         """Where a motion touches or leaves the limits, shape (N, J)."""
         positions = motion.positions_within(CHECK_S)
+        if isinstance(self.checks, ConstrainedChecks) and self.checks.first_broken(positions) < len(positions):
+            self.refused = motion
         lower, upper = self._limits
         # A joint outside its limits may only move inwards.
         lower, upper = np.minimum(lower, self.start), np.maximum(upper, self.start)
@@ -385,12 +462,12 @@ class _Plan:
         return np.asarray(np.concatenate(bad))
 
     def _stuck(self, start: Vector, goal: Vector) -> str:
-        line = Space(self.checks, *self._limits, _RESOLUTIONS_M[0]).line(start, goal)
+        line = self._space(_RESOLUTIONS_M[0]).line(start, goal)
         hit = self.checks.first_hit(line)
         message = f"no path found within {self.options.planning_time:g} s"
         if hit == len(line):
             return message
-        return f"{message}; on the straight way {sentence(self.checks.contacts(line[hit]))}"
+        return f"{message}; on the straight way {self._why(line[hit])}"
 
     def _result(self, motion: Motion, end: Candidate, number: int, fraction: float = 1.0) -> PlanResult:
         # Executors refuse positions outside the limits, even if only by rounding.

@@ -11,7 +11,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import accumulate, cycle, pairwise
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import attrs
 import numpy as np
@@ -73,9 +73,31 @@ class Space:
         number = max(math.ceil(np.abs(b - a) @ self.checks.reach / self.resolution), 1)
         return np.asarray(a + (np.arange(1, number + 1) / number)[:, None] * (b - a))
 
+    straight: ClassVar[bool] = True
+    """Whether trees grow along straight lines; otherwise along `curve`."""
+
     def free(self, a: Vector, b: Vector) -> bool:
         """Whether the line is free; `a` is not checked."""
         return self.checks.line_free(a, b, self.resolution)
+
+    def kept(self, configurations: Vector) -> Vector:
+        """Samples, shape (N, J), as the search may use them, shape (at most N, J)."""
+        return configurations
+
+    def curve(self, a: Vector, b: Vector, longest: float = math.inf) -> Vector:
+        """Points on the way from `a` towards `b`, without `a`, up to the first that is blocked.
+
+        Args:
+            a: free, shape (J,).
+            b: shape (J,); the last point is exactly `b` if `b` is free, and the way to it.
+            longest: greatest length of the line [rad].
+
+        Returns:
+            Shape (N, J), with free straight lines between them; N may be 0.
+        """
+        length = float(np.linalg.norm(b - a))
+        end = b if length <= longest else a + (b - a) * (longest / length)
+        return end[None] if self.free(a, end) else np.empty((0, len(a)))
 
 
 @attrs.frozen(eq=False)
@@ -190,11 +212,13 @@ def connect(
     for goal in sorted(goals, key=lambda each: float(np.linalg.norm(each - start))):
         if space.free(start, goal):
             return [start, goal]
+        if not space.straight and _reaches(points := space.curve(start, goal), goal):
+            return [start, *points]
     iterations = float(_ITERATIONS)
     for longest, whole in cycle(_RUNS):
         if expired():
             break
-        extended = _extended if whole else _extended_in_part
+        extended = _extended_along if not space.straight else _extended if whole else _extended_in_part
         path = _grown(space, start, goals, rng, expired, int(iterations), partial(extended, space, longest))
         if path is not None:
             return path
@@ -239,7 +263,8 @@ def _samples(space: Space, rng: Random, number: int) -> Iterator[tuple[Vector, b
     for _ in range(0, number, _DRAWN):
         configurations = space.lower + rng.random((_DRAWN, len(width))) * width
         some = (rng.random(_DRAWN) < _SOME_JOINTS).tolist()
-        yield from zip(configurations, some, rng.random(configurations.shape) < 0.5, strict=True)
+        joints = rng.random(configurations.shape) < 0.5
+        yield from zip(space.kept(configurations), some, joints, strict=False)
 
 
 def _extended(space: Space, longest: float, tree: _Tree, parent: int, target: Vector, *, once: bool) -> int | None:
@@ -283,6 +308,21 @@ def _extended_in_part(
     return tree.add(line[free - 1] if free < len(line) else end, parent)
 
 
+def _extended_along(
+    space: Space, longest: float, tree: _Tree, parent: int, target: Vector, *, once: bool
+) -> int | None:
+    """Grow a tree from a node along a curve towards `target`, until it is blocked; as `_extended`."""
+    last = None
+    for point in space.curve(tree.node(parent).copy(), target, longest if once else math.inf):
+        last = parent = tree.add(point, parent)
+    return last
+
+
+def _reaches(points: Vector, end: Vector) -> bool:
+    """Whether points of a curve end at `end`."""
+    return len(points) > 0 and np.array_equal(points[-1], end)
+
+
 def length(path: Vector) -> float:
     """Length of a polyline, shape (N, J), in the unit of its points."""
     return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
@@ -304,6 +344,8 @@ def shortened(space: Space, path: Sequence[Vector], rng: Random, pace: Pace) -> 
         if i == j:
             continue
         inner = [] if rng.random() < _STRAIGHT else _with_even_joint(a, best[i + 1 : j + 1], b, rng)
+        if not (space.straight or inner or space.free(a, b)) and _reaches(points := space.curve(a, b), b):
+            inner = list(points[:-1])
         candidate = _straightened([*best[: i + 1], a, *inner, b, *best[j + 1 :]])
         faster = pace.time(np.array(candidate))
         if faster < time * (1 - _SHORTER) and all(space.free(c, d) for c, d in pairwise([a, *inner, b])):

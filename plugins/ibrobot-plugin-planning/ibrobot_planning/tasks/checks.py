@@ -14,7 +14,7 @@ from ibrobot_core.app import ControlMode, Plugins, RobotConfig, check_models
 from ibrobot_planning.execution.plans import tool_planners
 from ibrobot_planning.goals.grammar import GoalOptions
 from ibrobot_planning.goals.joints import named_pose, pose_names
-from ibrobot_planning.planner import AnyGoal, Goal, LinearGoal, PoseGoal, PositionGoal
+from ibrobot_planning.planner import AnyGoal, ConstrainedGoal, Goal, LinearGoal, PoseGoal, PositionGoal
 from ibrobot_planning.tasks.format import (
     Alternatives,
     GripperStep,
@@ -210,7 +210,8 @@ class _Checks:
             # Written so that NaN fails it.
             elif not limits.lower <= value <= limits.upper:
                 self._document.add(at, f"{value} rad is outside the limits {limits.lower} .. {limits.upper} rad")
-        if goal.of_tool and self._planner not in self._tool_planners:
+        constrained = goal.path_constraints is not None
+        if (goal.of_tool or constrained) and self._planner not in self._tool_planners:
             types = ", ".join(self._tool_planners) or "none is installed"
             self._document.add(
                 key, f"planner type {self._planner!r} takes joint positions only; types that take others: {types}"
@@ -254,7 +255,9 @@ class _Checks:
             PlanningError: if not.
             KinematicsError: without a model of the robot.
         """
-        if isinstance(goal, LinearGoal):
+        if isinstance(goal, ConstrainedGoal):
+            self._within_reach(goal.goal)
+        elif isinstance(goal, LinearGoal):
             for waypoint in goal.waypoints:
                 self._within_reach(waypoint)
         elif isinstance(goal, AnyGoal):

@@ -8,7 +8,7 @@ from typing import Any, Literal, override
 import attrs
 
 from ibrobot_core.api import Robot, Vector, documented, option
-from ibrobot_planning.goals.grammar import LEAST_SCALING, GoalOptions, exactly_one, line_goal
+from ibrobot_planning.goals.grammar import LEAST_SCALING, GoalOptions, check_waypoints, exactly_one, line_goal
 from ibrobot_planning.goals.joints import named_pose
 from ibrobot_planning.goals.text import Target
 from ibrobot_planning.planner import AnyGoal, Goal
@@ -33,14 +33,13 @@ class MoveStep(GoalOptions):
         values = attrs.asdict(self, recurse=False)
         # Keys of a goal belong to the goals in `any` or `line`.
         for field in attrs.fields(GoalOptions) if several else ():
-            if values[field.name] not in (field.default, {}) and not self.kinds().get(field.name):
+            of_line = self.line and field.name == "path_constraints"
+            if values[field.name] not in (field.default, {}) and not self.kinds().get(field.name) and not of_line:
                 raise ValueError(f"{field.name} belongs to the goals in {several}")
         super().__attrs_post_init__()
         if self.least_fraction != 1 and not self.line:
             raise ValueError("least_fraction belongs to line")
-        for i, each in enumerate(self.line):
-            if not each.of_tool:
-                raise ValueError(f"line.{i}: a straight line goes to a position: xyz or object")
+        check_waypoints(self.line)
 
     @override
     def kinds(self) -> dict[str, bool]:
@@ -65,12 +64,12 @@ class MoveStep(GoalOptions):
             goal = AnyGoal(tuple(each.goal(world, tool) for each in self.any))
         elif self.line:
             text = f"line to {self.line[-1].text}"
-            goal = line_goal(self.line, self.least_fraction, world, tool)
+            goal = line_goal(self.line, self.least_fraction, self.path_constraints, world, tool)
         elif self.pose is not None:
             joints = {joint: value for joint, value in named_pose(robot, self.pose).items() if joint in arm}
         elif self.of_tool or self.joint_tolerance:
             goal, joints = self.goal(world, tool), {}
-        return Target(text, goal, joints, self.speed)
+        return Target(text, goal, joints, self.speed, constraints=None if goal is not None else self.path_constraints)
 
 
 @documented
