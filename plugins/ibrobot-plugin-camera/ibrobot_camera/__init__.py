@@ -57,6 +57,7 @@ def ibrobot_guides() -> Iterable[GuideDescriptor]:
     summary = "List the cameras, with their formats and a picture of each."
     yield GuideDescriptor(
         "cameras",
+        order=60,
         label="Cameras",
         summary=summary,
         make=Late("ibrobot_camera.guides:show_cameras"),
@@ -64,6 +65,7 @@ def ibrobot_guides() -> Iterable[GuideDescriptor]:
     )
     yield GuideDescriptor(
         "lens",
+        order=70,
         label="Calibrate a camera",
         summary="Measure the lens of a camera with a printed board; `ibrobot camera board` makes the page to print.",
         make=Late("ibrobot_camera.commands.calibrate:guided"),

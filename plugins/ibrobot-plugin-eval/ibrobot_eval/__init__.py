@@ -31,6 +31,7 @@ def ibrobot_reports() -> Iterable[ReportDescriptor]:
         KIND,
         summary="Successes of policies, and their comparison.",
         label="Results",
+        command="eval",
         reads=_is_evaluation,
         lines=Late("ibrobot_eval.contents:lines_of"),
         make=Late("ibrobot_eval.contents:read_contents"),

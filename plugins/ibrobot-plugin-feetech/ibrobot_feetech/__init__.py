@@ -29,18 +29,21 @@ def ibrobot_guides() -> Iterable[GuideDescriptor]:
     """Ports, motors and calibration."""
     yield GuideDescriptor(
         "ports",
+        order=10,
         label="Serial ports",
         summary="List the USB serial ports, and which are adapters of an SO-101.",
         make=Late("ibrobot_feetech.guides:list_all"),
     )
     yield GuideDescriptor(
         "port",
+        order=20,
         label="Find an arm's port",
         summary="Unplug the arm and plug it in again to find its port.",
         make=Late("ibrobot_feetech.guides:find"),
     )
     yield GuideDescriptor(
         "motors",
+        order=30,
         label="Set up motors",
         summary="Give each servo its id and 1 Mbaud, with one servo connected at a time.",
         make=Late("ibrobot_feetech.guides:set_up"),
@@ -48,6 +51,7 @@ def ibrobot_guides() -> Iterable[GuideDescriptor]:
     )
     yield GuideDescriptor(
         "calibration",
+        order=40,
         label="Calibrate an arm",
         summary="Measure the middle pose and the range of each joint, moved by hand.",
         make=Late("ibrobot_feetech.guides:calibrate"),
@@ -55,6 +59,7 @@ def ibrobot_guides() -> Iterable[GuideDescriptor]:
     )
     yield GuideDescriptor(
         "servos",
+        order=50,
         label="Check an arm",
         summary="Compare the servos with their calibration.",
         make=Late("ibrobot_feetech.guides:check"),

@@ -1,11 +1,11 @@
 """The whole way on the page of `ibrobot ui`: from a robot's YAML to a policy that was trained, evaluated and launched.
 
     npm pack axe-core && tar xzf axe-core-*.tgz
-    python plugins/ibrobot-plugin-web/tests/clicks.py FOLDER --axe package/axe.min.js [--keyboard] [--episodes 10]
+    python plugins/ibrobot-plugin-web/tests/clicks.py FOLDER --axe package/axe.min.js [--keyboard] [--language zh-CN]
 
 Counts the fewest clicks, keys and characters of each stage; with `--keyboard` the pointer is never used, and the tabs
-to each place are counted. Writes pictures of each screen, as `look.py` does, and at the end of every view, in English
-and Chinese, and prints what axe-core finds serious or critical. Needs Chromium, playwright and LeRobot.
+to each place are counted. Writes pictures of each screen, as `look.py` does, and at the end of every view, and prints
+what axe-core finds serious or critical. Needs Chromium, playwright and LeRobot.
 """
 
 from __future__ import annotations
@@ -98,6 +98,22 @@ class Keyboard(Hand):
         raise AssertionError(f"{element}: not reached by {_TABS} tabs")
 
 
+def said(page: Any, text: str) -> str:
+    """A text of the pages in the language of the browser."""
+    shown: str = page.evaluate("async (text) => (await import('/static/words.js')).words(text)", text)
+    return shown
+
+
+def button(page: Any, text: str, role: str = "button", within: str = "body") -> Any:
+    """The button with a text, or what else has it."""
+    return page.locator(within).get_by_role(role, name=said(page, text), exact=True)
+
+
+def labelled(page: Any, text: str) -> Any:
+    """The field with a label."""
+    return page.get_by_label(said(page, text), exact=True)
+
+
 def stages(hand: Hand, page: Any, look_at: Any, episodes: int) -> Iterator[str]:
     """Walk the way; yields the name of each stage that is done."""
     run = begin(hand, page, look_at, episodes)
@@ -117,13 +133,12 @@ def stages(hand: Hand, page: Any, look_at: Any, episodes: int) -> Iterator[str]:
 def begin(hand: Hand, page: Any, look_at: Any, episodes: int) -> Any:
     """Start a session; returns its page."""
     look_at(page, "way-01-first")
-    hand.press(page.locator("#nav").get_by_role("link", name="Record", exact=True))
-    hand.type(page.get_by_label("Task"), "pick the cube")
-    hand.type(page.get_by_label("Episodes", exact=True), str(episodes))
+    hand.press(button(page, "Record", "link", "#nav"))
+    hand.type(labelled(page, "Task"), "pick the cube")
+    hand.type(labelled(page, "Episodes"), str(episodes))
     look_at(page, "way-02-record")
-    start = page.get_by_role("button", name="Start the session")
     with page.context.expect_page(timeout=_WAIT_MS) as opened:
-        hand.press(start)
+        hand.press(button(page, "Start the session"))
     run = opened.value
     run.wait_for_url(re.compile("^http"), wait_until="commit", timeout=_WAIT_MS)
     until(run, "window.ibrobot?.jogs.length && ibrobot.status.episode")
@@ -132,6 +147,7 @@ def begin(hand: Hand, page: Any, look_at: Any, episodes: int) -> Any:
 
 def judge(hand: Hand, page: Any, run: Any, look_at: Any, episodes: int) -> None:
     """Record and judge the episodes."""
+    drawn(run)
     look_at(run, "way-03-run")
     for number in range(episodes):
         joint, index = (("shoulder_pan", 0), ("wrist_roll", 4))[number % 2]
@@ -139,7 +155,7 @@ def judge(hand: Hand, page: Any, run: Any, look_at: Any, episodes: int) -> None:
         hand.key(run, "b")
         before = run.evaluate("ibrobot.state.position")[index]
         moved = f"ibrobot.status.episode.elapsed_s > 1 && Math.abs(ibrobot.state.position[{index}] - {before}) > 0.2"
-        hand.hold(run, f"{joint} {way}, hold to move", moved)
+        hand.hold(run, said(run, f"{joint} {way}, hold to move"), moved)
         if number == 0:
             look_at(run, "way-04-episode")
         hand.key(run, "s")
@@ -154,52 +170,54 @@ def judge(hand: Hand, page: Any, run: Any, look_at: Any, episodes: int) -> None:
 def convert(hand: Hand, page: Any, look_at: Any) -> None:
     """Make a dataset of them."""
     look_at(page, "way-07-session")
-    hand.press(page.locator(".job").get_by_role("link", name="Convert", exact=True))
+    hand.press(button(page, "Convert", "link", ".job"))
     until(page, "document.querySelector('#field-out')?.value")
     look_at(page, "way-08-convert")
-    hand.press(page.locator("#main").get_by_role("button", name="Convert", exact=True))
-    page.get_by_role("link", name="Open the dataset").wait_for(timeout=_WAIT_MS)
+    hand.press(button(page, "Convert", within="#main"))
+    button(page, "Open the dataset", "link").wait_for(timeout=_WAIT_MS)
 
 
 def train(hand: Hand, page: Any, look_at: Any) -> None:
     """Train a policy."""
     look_at(page, "way-09-converted")
-    hand.press(page.locator(".job:visible").get_by_role("link", name="Train", exact=True))
-    page.get_by_label("Steps", exact=True).wait_for()
+    hand.press(button(page, "Train", "link", ".job:visible"))
+    labelled(page, "Steps").wait_for()
     until(page, "!document.querySelector('#view-job-train form button.primary').disabled")
-    if (steps := page.get_by_label("Steps", exact=True)).input_value():
+    if (steps := labelled(page, "Steps")).input_value():
         steps.fill("")
     hand.type(steps, "50")
     look_at(page, "way-10-train")
-    hand.press(page.locator("#main").get_by_role("button", name="Train", exact=True))
+    hand.press(button(page, "Train", within="#main"))
     page.locator(".job:visible .state.running").first.wait_for(timeout=_WAIT_MS)
     page.wait_for_timeout(5000)
     look_at(page, "way-11-training")
-    page.get_by_role("link", name="Use it in a robot").wait_for(timeout=4 * _WAIT_MS)
+    button(page, "Use it in a robot", "link").wait_for(timeout=4 * _WAIT_MS)
 
 
 def launch(hand: Hand, page: Any, look_at: Any) -> None:
     """Put the policy into the robot, and launch it."""
     look_at(page, "way-12-trained")
-    hand.press(page.get_by_role("link", name="Use it in a robot"))
-    page.get_by_role("button", name="Write the").wait_for(timeout=_WAIT_MS)
+    hand.press(button(page, "Use it in a robot", "link"))
+    write = button(page, "Write the file my_arm.yaml")
+    write.wait_for(timeout=_WAIT_MS)
     look_at(page, "way-13-change")
-    hand.press(page.get_by_role("button", name="Write the"))
-    button = page.get_by_role("button", name="Launch it in simulation")
-    button.wait_for()
+    hand.press(write)
+    begins = button(page, "Launch it in simulation")
+    begins.wait_for()
     look_at(page, "way-14-written")
     with page.context.expect_page(timeout=_WAIT_MS) as opened:
-        hand.press(button)
+        hand.press(begins)
     trained = opened.value
     trained.wait_for_url(re.compile("^http"), wait_until="commit", timeout=_WAIT_MS)
     until(trained, "(window.ibrobot?.status?.counts.dispatch?.plan_length ?? 0) > 0")
+    drawn(trained)
     look_at(trained, "way-15-runs")
     page.bring_to_front()
     look_at(page, "way-16-running")
     other = page.context.new_page()
     other.goto(page.url.split("#")[0])
     look.view(other, "jobs")
-    other.get_by_role("button", name="Stop the run").first.click()
+    button(other, "Stop the run").first.click()
     other.locator(".job .state.running").wait_for(state="hidden", timeout=_WAIT_MS)
     other.close()
     trained.close()
@@ -207,18 +225,23 @@ def launch(hand: Hand, page: Any, look_at: Any) -> None:
 
 def evaluate(hand: Hand, page: Any, look_at: Any) -> None:
     """Count the successes of the policy."""
-    hand.press(page.get_by_role("link", name="Evaluate it in simulation"))
-    page.locator("#main").get_by_role("button", name="Evaluate", exact=True).wait_for()
+    hand.press(button(page, "Evaluate it in simulation", "link"))
+    button(page, "Evaluate", within="#main").wait_for()
     page.wait_for_timeout(1500)
     look_at(page, "way-17-evaluate")
     page.locator("#field-episodes").fill("")
     hand.type(page.locator("#field-episodes"), "2")
-    hand.press(page.locator("#main").get_by_role("button", name="Evaluate", exact=True))
+    hand.press(button(page, "Evaluate", within="#main"))
     page.locator(".job:visible .state.done").first.wait_for(timeout=4 * _WAIT_MS)
     look_at(page, "way-18-evaluated")
-    hand.press(page.locator(".job:visible").get_by_role("link", name=re.compile("Results")).first)
+    hand.press(page.locator(".job:visible").get_by_role("link", name=said(page, "Results")).first)
     page.wait_for_timeout(3000)
     look_at(page, "way-19-results")
+
+
+def drawn(run: Any) -> None:
+    """Wait until the page of a run shows the robot."""
+    until(run, "ibrobot.view.frames > 3 && !document.querySelector('#view .note').textContent")
 
 
 def main() -> None:
@@ -228,8 +251,10 @@ def main() -> None:
     parser.add_argument("--axe", type=Path, help="axe.min.js; without it nothing is checked")
     parser.add_argument("--keyboard", action="store_true", help="without a pointer")
     parser.add_argument("--episodes", type=int, default=10)
+    parser.add_argument("--language", default=look.LANGUAGE[0], help="of the browser")
     parser.add_argument("--no-pictures", action="store_true", help="only count")
     chosen = parser.parse_args()
+    look.LANGUAGE[0] = chosen.language
     for size in ("zoom", "wide"):
         del look.SIZES[size]
     eye = look.Look(chosen.folder, chosen.axe.read_text(encoding="utf-8") if chosen.axe is not None else "")
@@ -246,7 +271,7 @@ def main() -> None:
             page = look.opened(chromium, address)
             page.context.set_default_timeout(_WAIT_MS)
             page.on("pageerror", lambda error: problems.append(str(error)))
-            page.get_by_text("No problems found.").wait_for()
+            page.get_by_text(said(page, "No problems found.")).wait_for()
             try:
                 for stage in stages(hand, page, look_at, chosen.episodes):
                     now = hand.total()
@@ -257,13 +282,11 @@ def main() -> None:
                 page.screenshot(path=chosen.folder / "failed.png", full_page=True)
                 raise
             if not chosen.no_pictures:
-                for language in ("en", "zh-CN"):
-                    look.LANGUAGE[0] = language
-                    other = look.opened(chromium, address)
-                    until(other, "ibrobot.session.views.length")
-                    for name in other.evaluate("ibrobot.session.views.map(({name}) => name)"):
-                        look.view(other, name)
-                        look_at(other, f"filled-{language}-{name}")
+                other = look.opened(chromium, address)
+                until(other, "ibrobot.session.views.length")
+                for name in other.evaluate("ibrobot.session.views.map(({name}) => name)"):
+                    look.view(other, name)
+                    look_at(other, f"filled-{name}")
     print("all", hand.total(), f"{eye.wrong} serious or critical", *problems, sep="\n")
     sys.exit(1 if eye.wrong or problems else 0)
 

@@ -86,16 +86,21 @@ class Run:
     def __init__(self) -> None:
         self.guard = page_guard(WebOptions(port=0), any_port="0")
         self.broadcast = Broadcast(lambda: None, frozenset({STATE, STATUS}))
-        self.drive = Drive(lambda _, answer: answer({"ok": None}), self._stop, lambda: None)
+        self.drive = Drive(self._carry_out, self._stop, lambda: None)
+        self.refused = ""
+        """Why it refuses each command; empty: it does not."""
+
+    def _carry_out(self, _: object, answer: Answer) -> None:
+        answer({"error": self.refused} if self.refused else {"ok": None})
 
     @staticmethod
     def _stop(answer: Answer) -> None:
         answer({"ok": None})
 
-    def show(self, found: Mapping[str, Any]) -> None:
+    def show(self, found: Mapping[str, Any], *, estop: bool = False) -> None:
         """Show a status, and a robot at rest."""
         zeros = [0.0] * len(found["robot"]["joints"])
-        state = {"stamp": 1, "estop": False, "stops": 0, "stale": False, "position": zeros, "command": zeros}
+        state = {"stamp": 1, "estop": estop, "stops": 0, "stale": False, "position": zeros, "command": zeros}
         for channel, message in ((STATUS, found), (STATE, state)):
             self.broadcast.publish(channel, json.dumps(message).encode())
 
@@ -147,6 +152,7 @@ async def look() -> None:
         )
         await look_at_one_arm(page, run)
         await look_at_keys(page, run)
+        await look_at_messages(page, run)
         await page.locator("#mode summary").click()
         assert await page.get_by_role("button", name="drive by keys keyboard needs a terminal").is_disabled()
         await page.get_by_role("button", name="run the policy pick").click()
@@ -180,6 +186,28 @@ async def look_at_one_arm(page: Any, run: Run) -> None:
     await page.get_by_role("button", name="Close").click()
     run.show(status())
     await until(page, "!document.querySelector('.joint .name').title.startsWith('right_')")
+
+
+async def look_at_messages(page: Any, run: Run) -> None:
+    """Errors do not pile up, nor cover what a person presses; no episode begins while the robot is stopped."""
+    run.show(status())
+    await page.get_by_role("button", name="Begin").wait_for()
+    for text in ("one", "two", "three", "four", "five", "five"):
+        run.refused = text
+        await page.evaluate("void ibrobot.call('/planning/go_to', {goal: 'nowhere'})")
+        await page.locator(".toast").get_by_text(text).wait_for()
+    shown = page.locator(".toast.error p")
+    assert await shown.all_inner_texts() == ["three", "four", "five"], "the last ones, and each once"
+    assert await page.evaluate(OUT_OF_SIGHT, ["#stop", "#record button", "#toggles button", ".pad button"]) == []
+    run.refused = "six"
+    run.show(status(), estop=True)
+    await page.get_by_role("button", name="Reset").wait_for()
+    await until(page, "document.querySelector('[data-key=b]').disabled")
+    await page.keyboard.press("b")
+    run.show(status())
+    await until(page, "!document.querySelector('[data-key=b]').disabled")
+    assert await shown.all_inner_texts() == ["three", "four", "five"], "the key did nothing"
+    run.refused = ""
 
 
 async def look_at_keys(page: Any, run: Run) -> None:

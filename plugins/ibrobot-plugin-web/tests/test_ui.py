@@ -12,6 +12,7 @@ from typing import Any
 
 import aiohttp
 import pytest
+from ibrobot_provenance.reports import ReportDescriptor
 from ibrobot_web.ui.forms import takes
 from ibrobot_web.ui.server import views
 from ui_server import UiServer, run_ui
@@ -38,13 +39,32 @@ def test_every_view_has_its_module_for_browsers(tmp_path: Path) -> None:
 def test_views_stand_in_groups_in_the_order_of_the_work() -> None:
     groups: dict[str, list[str]] = {}
     for view in views():
-        groups.setdefault(view["group"], []).append(view["name"])
+        if not view.get("within"):
+            groups.setdefault(view["group"], []).append(view["name"])
     assert list(groups) == ["Set up", "Record", "Learn", "Evaluate", ""]
-    jobs = ("convert", "train", "explain", "datasets check")
+    jobs = ("convert", "train", "datasets check")
     learn = [f"job-{name}" for name in jobs if takes(name)]  # installed ones
     assert [name for name in groups["Learn"] if name not in learn] == ["datasets", "policies"]
     assert set(learn) <= set(groups["Learn"])
     assert "job-eval" in groups["Evaluate"]
+    for name, group in (("explain", "Evaluate"), ("preflight", "Set up")):  # by what a person wants with them
+        found = [each for each, members in groups.items() if f"job-{name}" in members]
+        assert found == ([group] if takes(name) else [])
+
+
+@pytest.mark.parametrize(
+    ("command", "within", "group"),
+    [("convert", "job-convert", "Learn"), ("", "", "Evaluate"), ("brew", "", "Evaluate")],
+)
+def test_reports_are_reached_from_the_command_that_writes_them(
+    monkeypatch: pytest.MonkeyPatch, command: str, within: str, group: str
+) -> None:
+    made = ReportDescriptor(
+        "made", summary="", label="Made", command=command, reads=bool, lines=lambda _: [], make=lambda _: []
+    )
+    monkeypatch.setattr("ibrobot_web.ui.server.kinds_of_reports", lambda: {"made": made})
+    (view,) = [each for each in views() if each["name"] == "report-made"]
+    assert (view["within"], view["group"]) == (within, group)
 
 
 def test_nothing_is_served_without_a_session_and_watching_changes_nothing(tmp_path: Path) -> None:

@@ -33,6 +33,21 @@ def held(page: Any, address: str) -> Iterator[None]:
         route.continue_()
 
 
+def look_on_a_phone(page: Any) -> None:
+    """The navigation is one row, and each row of a table is a card whose values have the names of their columns."""
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.locator("#nav [data-name='episodes']").click()
+    page.get_by_role("link", name="episode_000001").wait_for()
+    places = page.locator("#nav a").evaluate_all("(links) => links.map((each) => each.getBoundingClientRect().top)")
+    assert max(places) - min(places) < 1
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    row = page.locator("#main tbody tr").first
+    cells = row.evaluate("(each) => [...each.cells].map((cell) => getComputedStyle(cell).display)")
+    assert set(cells) == {"block"}
+    named = row.locator("td").evaluate_all("(cells) => cells.map((each) => getComputedStyle(each, '::before').content)")
+    assert '"Outcome" ": "' in named
+
+
 def test_from_a_robot_to_its_dataset_by_clicks_alone(tmp_path: Path) -> None:
     sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
     from ui_path import FLAGS, convert, own_robot, record, ui_process
@@ -48,9 +63,15 @@ def test_from_a_robot_to_its_dataset_by_clicks_alone(tmp_path: Path) -> None:
         page.on("request", lambda request: hosts.add(request.url.split("/")[2]))
         page.goto(address)
         page.get_by_text("No problems found.").wait_for(timeout=60_000)
-        for name in page.evaluate("ibrobot.session.views.map(({name}) => name)"):
-            page.locator(f"#nav [data-name='{name}']").click()
+        for view in page.evaluate("ibrobot.session.views"):
+            name, within = view["name"], view.get("within")
+            if within:  # reached from the command that writes its reports
+                page.locator(f"#nav [data-name='{within}']").click()
+                page.locator("#main").get_by_role("link", name=view["title"], exact=True).click()
+            else:
+                page.locator(f"#nav [data-name='{name}']").click()
             page.locator(f"#view-{name.replace(' ', '-')}").wait_for(state="attached")
+            assert page.locator("#nav [aria-current]").get_attribute("data-name") == (within or name)
         page.get_by_role("link", name="Robots", exact=True).click()
         page.get_by_text("No problems found.").wait_for()
         assert page.get_by_label("Robot", exact=True).input_value() == "my_arm.yaml", "one's own, not a shipped one"
@@ -63,6 +84,7 @@ def test_from_a_robot_to_its_dataset_by_clicks_alone(tmp_path: Path) -> None:
             assert page.get_by_role("button", name="Convert", exact=True).is_disabled()
         page.go_back()
         convert(page)
+        look_on_a_phone(page)
         browser.close()
     assert not errors
     assert hosts == {address.split("/")[2]}

@@ -96,6 +96,8 @@ class ReportDescriptor(Descriptor[Any]):
     """Returns whether a folder is one, by the names of its files."""
     lines: Callable[[Path], Sequence[str]] = attrs.field(kw_only=True)
     """Returns the result of a folder in a few lines; raises IbrobotError."""
+    command: str = attrs.field(default="", kw_only=True)
+    """The command that writes such folders, e.g. `eval`; on pages its view leads to the reports."""
 
 
 def kinds_of_reports() -> dict[str, ReportDescriptor]:

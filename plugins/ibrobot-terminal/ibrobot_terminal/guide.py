@@ -81,11 +81,14 @@ class GuideDescriptor(Descriptor[Any]):
     """Does the work in a process of its own, with the answers to the questions by name."""
     questions: Callable[[], Sequence[Question]] = attrs.field(default=lambda: (), kw_only=True)
     """Returns the questions that are asked first, e.g. for the port, with what is plugged in as choices."""
+    order: int = attrs.field(default=1000, kw_only=True)
+    """Place among the guides, as a new user needs them: to find a port comes before a calibration."""
 
 
 def installed_guides() -> list[GuideDescriptor]:
-    """The guides of all plugins."""
-    return [each for each in installed_plugins().of_kind("guide") if isinstance(each, GuideDescriptor)]
+    """The guides of all plugins, in their order."""
+    found = [each for each in installed_plugins().of_kind("guide") if isinstance(each, GuideDescriptor)]
+    return sorted(found, key=lambda each: each.order)
 
 
 @attrs.frozen

@@ -232,7 +232,7 @@ page.stream.addEventListener("state", ({ detail: state }) => {
   page.arrived = performance.now();
   view.tell({ do: "state", state });
   joints.state(state);
-  if (before?.estop !== state.estop) showFaults();
+  if (before?.estop !== state.estop) update();
 });
 page.stream.addEventListener("status", ({ detail: status }) => {
   const first = !page.status;

@@ -27,7 +27,7 @@ export class Record {
       return;
     }
     this.cues.hear(episode);
-    say(this.facts, words(episode));
+    say(this.facts, words(episode, ended));
     this.facts.classList.toggle("recording", episode.recording);
     this.facts.setAttribute("aria-live", episode.recording ? "off" : "polite"); // the time runs
     say(this.problem, episode.failure);
@@ -85,10 +85,10 @@ export class Record {
 
 const count = (number) => `${number} episode${number === 1 ? "" : "s"}`;
 
-function words({ recording, waiting, saved, wanted, elapsed_s: elapsed, max_duration_s: longest, free_bytes: free, bytes_per_s: flow }) {
+function words({ recording, waiting, saved, wanted, elapsed_s: elapsed, max_duration_s: longest, free_bytes: free, bytes_per_s: flow }, ended) {
   if (recording) return `● ${saved + 1}${wanted ? ` of ${wanted}` : ""} · ${elapsed.toFixed(1)} of ${longest} s`;
   if (waiting) return `Ready: ${saved + 1}${wanted ? ` of ${wanted}` : ""} begins when the robot follows you`;
   const minutes = flow ? Math.floor(free / flow / 60) : Infinity;
   const left = minutes < 120 ? ` · disk for ${minutes} min` : free < 5 * GIB ? ` · ${(free / GIB).toFixed(1)} GiB left` : "";
-  return `${saved}${wanted ? ` of ${wanted}` : ""} saved${wanted && saved >= wanted ? " · the session ends" : ""}${left}`;
+  return `${saved}${wanted ? ` of ${wanted}` : ""} saved${wanted && saved >= wanted && !ended ? " · the session ends" : ""}${left}`;
 }

@@ -121,8 +121,9 @@ function address() {
 
 async function showView() {
   const [name, rest] = address();
+  const { within } = ui.session.views.find((view) => view.name === name);
   for (const link of $("nav").querySelectorAll("a")) {
-    if (link.dataset.name === name) {
+    if (link.dataset.name === (within || name)) {
       link.setAttribute("aria-current", "page");
       $("nav").scrollTo({ left: link.offsetLeft - 60 }); // on a phone it is one row that scrolls
     }
@@ -167,7 +168,7 @@ window.addEventListener("focus", () => shown?.show?.(true, address()[1]));
 ui.session = await ui.get("session");
 say($("folder"), ui.session.folders.join(" · "));
 say($("role"), ui.drives ? "" : "watching only");
-const groups = Map.groupBy(ui.session.views, ({ group }) => group);
+const groups = Map.groupBy(ui.session.views.filter(({ within }) => !within), ({ group }) => group);
 $("nav").append(...[...groups].map(([group, members]) => h("div", group ? { role: "group", "aria-label": group } : {},
   group ? h("span", { class: "heading", "aria-hidden": "true" }, group) : null,
   ...members.map(({ name, title }) => h("a", { href: `#${name}`, "data-name": name }, title)))));

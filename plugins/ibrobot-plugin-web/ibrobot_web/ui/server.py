@@ -33,6 +33,8 @@ GROUPS = {
 of report has one, all by `static/ui/reports.js`."""
 SHOWN = {"episodes": "datasets", "dataset": "policies"}
 """Kind of a command's input -> the view before which its own stands; others are in the last group."""
+PLACED = {"explain": "Evaluate", "preflight": "Set up"}
+"""Command -> the group at whose end it stands, where its input would put it into another one."""
 ROUTED = (*(name for names in GROUPS.values() for name in names), "reports")
 """The modules with `ROUTES`."""
 LARGEST_REQUEST = 1 << 20
@@ -75,7 +77,7 @@ def make_app(guard: Guard, ui: Ui) -> web.Application:
 
 
 def views() -> list[dict[str, Any]]:
-    """The views for browsers, in the order of the work."""
+    """The views for browsers, in the order of the work. One that stands `within` another is reached from that one."""
     made: list[dict[str, Any]] = [
         {"name": name, "title": name.capitalize(), "module": name, "group": group}
         for group, names in GROUPS.items()
@@ -89,11 +91,18 @@ def views() -> list[dict[str, Any]]:
         }  # fmt: skip
         before = next((SHOWN[kind] for kind in job["takes"] if kind in SHOWN), "")
         at = next((i for i, view in enumerate(made) if view["name"] == before), len(made) - 1)
-        made.insert(at, {**job, "group": made[at]["group"] or last})
-    made[-1:-1] = [
-        {"name": f"report-{kind}", "title": each.label, "module": "reports", "report": kind, "group": last}
-        for kind, each in kinds_of_reports().items()
-    ]
+        group = made[at]["group"] or last
+        if command in PLACED:
+            group = PLACED[command]
+            at = max((i + 1 for i, view in enumerate(made) if view["group"] == group), default=len(made) - 1)
+        made.insert(at, {**job, "group": group})
+    groups = {view["name"]: view["group"] for view in made}
+    for kind, each in kinds_of_reports().items():
+        within = f"job-{each.command}"
+        made.insert(-1, {
+            "name": f"report-{kind}", "title": each.label, "module": "reports", "report": kind,
+            "group": groups.get(within, last), "within": within if within in groups else "",
+        })  # fmt: skip
     return made
 
 

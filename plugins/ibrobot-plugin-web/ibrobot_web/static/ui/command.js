@@ -5,8 +5,9 @@ import { Form } from "./form.js";
 import { JobList } from "./job.js";
 
 export class View {
-  constructor(ui, { command, title }) {
+  constructor(ui, { name, command, title }) {
     this.ui = ui;
+    this.reports = ui.session.views.filter(({ within }) => within === name);
     this.command = command;
     this.title = title;
     this.jobs = new JobList(ui, "None yet.", command);
@@ -14,7 +15,8 @@ export class View {
 
   mount(element) {
     this.form = new Form(this.title, (values) => this.start(values));
-    element.append(h("h2", {}, this.title), this.form.element, h("h2", {}, "Jobs"), this.jobs.element);
+    const reports = this.reports.map((each) => h("a", { class: "button", href: `#${each.name}` }, each.title));
+    element.append(h("div", { class: "row" }, h("h2", {}, this.title), reports), this.form.element, h("h2", {}, "Jobs"), this.jobs.element);
   }
 
   // The address may fill in fields: FIELD=VALUE, one in each line.

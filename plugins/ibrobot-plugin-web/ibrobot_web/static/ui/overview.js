@@ -58,7 +58,7 @@ export class Overview {
 
 function record({ episodes, unjudged, newest }) {
   if (!episodes) return ["No episode yet.", link("record", "Record some")];
-  return [`${count(episodes, "episode")}, ${unjudged} not judged.`,
+  return [unjudged ? `${count(episodes, "episode")}, ${unjudged} not judged.` : `${count(episodes, "episode")}, all judged.`,
     h("ul", { class: "list", "aria-label": "The newest" }, newest.map(({ path, task, outcome, began_s: began }) => h("li", {},
       h("a", { href: `#episodes/${encodeURIComponent(path)}` }, task ? `“${task}”` : path.split("/").at(-1)), ", ", h("span", {}, outcome), began > FIRST_S ? `, ${when(began)}` : null))),
     unjudged ? link("episodes", `Judge ${count(unjudged, "episode")}`) : link("record", "Record more")];

@@ -1,6 +1,6 @@
 // View: trained policies, which are put into robot YAMLs.
 
-import { h, problem, refresh, toast, when } from "../dom.js";
+import { h, problem, refresh, when } from "../dom.js";
 import { remember } from "./chooser.js";
 
 export class View {
@@ -86,7 +86,6 @@ export class View {
   async write(request, { digest }) {
     const done = await this.ui.attempt(() => this.ui.post("policies/apply", { ...request, digest }));
     if (!done) return;
-    toast(`${done.robot} is written.`);
     const launched = { robot: done.robot, sim: true, mode: done.mode };
     remember(launched);
     const evaluation = this.ui.session.views.find(({ name }) => name === "job-eval");
