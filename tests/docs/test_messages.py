@@ -159,6 +159,19 @@ def test_an_option_beside_a_command_in_a_message_exists(text: Text) -> None:
     assert named - FOREIGN <= set(all_options(cli, click.Context(cli))), text
 
 
+def test_no_message_tells_a_person_to_run_a_pip() -> None:
+    """An environment of uv has none: `how_to_install` says what installs into the one that runs."""
+    wrong = [
+        f"{text}: {text.text!r}"
+        for file in SOURCES
+        if file != ROOT / "ibrobot_core/errors.py"
+        for helps in [_is_help(file)]
+        for text in _texts(file)
+        if "pip install" in text.text and text.line not in helps
+    ]
+    assert wrong == []
+
+
 def test_a_made_up_option_and_command_are_found() -> None:
     for wrong in (
         "`ibrobot convert --robot-type`",

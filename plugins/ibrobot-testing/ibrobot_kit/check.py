@@ -16,7 +16,7 @@ from urllib.parse import unquote, urlsplit
 import attrs
 from packaging.requirements import Requirement
 
-from ibrobot_core.api import MESSAGE_TYPES, Check, Descriptor, Late, MessageDescriptor, option
+from ibrobot_core.api import MESSAGE_TYPES, Check, Descriptor, Late, MessageDescriptor, how_to_install, option
 from ibrobot_core.app import Registry, RequestError, Unsuccessful, echo, installed_plugins
 
 HEAVY = ("av", "cv2", "lerobot", "mujoco", "numpy", "pinocchio", "pyarrow", "scipy", "torch")
@@ -150,9 +150,8 @@ def _tests(package: Distribution) -> Iterator[Check]:
     """Run its tests, if its source is here, and name what they could not check."""
     folder = _source(package)
     if folder is None:
-        yield Check(
-            "tests", False, "not run: wheels have no tests; install its source by pip install -e", matters=False
-        )
+        remedy = how_to_install("-e", "FOLDER")
+        yield Check("tests", False, f"not run: wheels have no tests; install its source by {remedy}", matters=False)
         return
     tests = folder / "tests"
     texts = [file.read_text(encoding="utf-8") for file in sorted(tests.rglob("test_*.py"))] if tests.is_dir() else []

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import inspect
 import re
+import shlex
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from importlib import import_module
@@ -16,7 +18,7 @@ import attrs
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ibrobot_core import api
-from ibrobot_core.api import Late, option
+from ibrobot_core.api import Late, how_to_install, option
 from ibrobot_core.app import Registry, RequestError, echo, installed_plugins
 from ibrobot_kit.excerpt import excerpt
 from ibrobot_kit.imports import arranged
@@ -74,6 +76,7 @@ class NewPlugin:
     def show(self, made: dict[str, Any]) -> None:
         """Print what comes next."""
         echo(f"{made['folder']}: {len(made['files'])} files")
+<<<<<<< HEAD
         if made["entered"]:
             echo(f"entered in {', '.join(made['entered'])}")
             echo("next: uv sync --group cluster && uv run python tests/house/official_plugins.py")
@@ -82,6 +85,12 @@ class NewPlugin:
             return
         echo(f'next: cd {made["folder"]} && pip install -e ".[test]" && pytest')
         echo("then: the command at the top of its robot YAML")
+=======
+        here = Path(sys.executable)
+        python = "python" if Path(shutil.which("python") or "").parent == here.parent else shlex.quote(str(here))
+        echo(f"next: cd {made['folder']} && {how_to_install('-e', '.[test]')} && {python} -m pytest")
+        echo(f"then: ibrobot launch {self.name}.yaml --sim --headless --duration 2")
+>>>>>>> afa4d2bc (Remedies of the kit name the installer of their environment; a test finds those that do not)
 
 
 def render(kind: str, name: str, *, outside: bool = True) -> dict[str, str]:

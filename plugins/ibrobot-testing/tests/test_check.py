@@ -11,7 +11,7 @@ from ibrobot_kit.check import CheckPlugin, examine
 from ibrobot_kit.new import NewPlugin
 from ibrobot_testing.site import Site, made_up_site
 
-from ibrobot_core.api import Check
+from ibrobot_core.api import Check, how_to_install
 from ibrobot_core.app import RequestError, Unsuccessful, installed_plugins
 
 PLUGIN = """
@@ -63,7 +63,7 @@ def test_good_package_fails_nothing_and_says_what_was_not_run(site: Site, capsys
         "ok    weight: fake_wave imports nothing heavy",
         "ok    teleop wave: options have help",
         "ok    teleop wave: ibrobot_testing.fakes.host:FakeTeleop is there",
-        "note  tests: not run: wheels have no tests; install its source by pip install -e",
+        f"note  tests: not run: wheels have no tests; install its source by {how_to_install('-e', 'FOLDER')}",
     ]
 
 
