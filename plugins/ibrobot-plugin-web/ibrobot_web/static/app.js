@@ -155,13 +155,14 @@ function showHeader() {
 
 function showOperator() {
   const { operating, operator, role, pages } = page.drive.facts;
+  const ended = page.status?.ended ?? false;
   document.body.classList.toggle("operating", operating);
-  const who = !page.drive.open ? "" : operating ? "you operate" : operator ? `watching · ${operator} operates` : "watching · no operator";
+  const who = !page.drive.open || ended ? "" : operating ? "you operate" : operator ? `watching · ${operator} operates` : "watching · no operator";
   say($("operator"), role === "watch" ? "watching only" : who && who + (pages > 1 ? ` · ${pages} pages` : ""));
   $("operator").classList.toggle("good", operating);
-  $("operate").hidden = role === "watch" || !page.drive.open;
+  $("operate").hidden = role === "watch" || !page.drive.open || ended;
   say($("operate"), operating ? "Only watch" : operator ? "Take over" : "Operate");
-  $("stop").disabled = role === "watch" || (page.status?.ended ?? false);
+  $("stop").disabled = role === "watch" || ended;
 }
 
 function showFaults() {

@@ -30,12 +30,13 @@ export class Motion {
     const { page } = this;
     const { services } = status;
     const dispatch = status.counts.dispatch;
-    refresh(this.jog, [page.jogs, page.device, page.operating, status.robot.tool, status.robot.poses, status.mode, status.help], () => this.motions(status));
+    refresh(this.jog, [page.jogs, page.device, page.operating, status.robot.tool, status.robot.poses, status.mode, status.help, status.ended], () => this.motions(status));
     refresh(this.plan, [services, page.operating, dispatch?.smoothing, status.commander], () => this.plans(services, dispatch, status));
   }
 
   motions(status) {
     const { page } = this;
+    if (status.ended) return [];
     if (!page.jogs.length) {
       const driven = status.robot.modes.filter(({ jogs, unavailable }) => Object.keys(jogs).length && !unavailable);
       const here = Object.keys(page.mode?.jogs ?? {}).length;

@@ -123,12 +123,10 @@ async function showView() {
   const [name, rest] = address();
   const { within } = ui.session.views.find((view) => view.name === name);
   for (const link of $("nav").querySelectorAll("a")) {
-    if (link.dataset.name === (within || name)) {
-      link.setAttribute("aria-current", "page");
-      $("nav").scrollTo({ left: link.offsetLeft - 60 }); // on a phone it is one row that scrolls
-    }
+    if (link.dataset.name === (within || name)) link.setAttribute("aria-current", "page");
     else link.removeAttribute("aria-current");
   }
+  showTab();
   document.title = `ibrobot: ${words(ui.session.views.find((view) => view.name === name).title)}`;
   if (current !== name) {
     clearToasts();
@@ -149,6 +147,12 @@ async function showView() {
   shown?.show?.(true, rest);
 }
 
+// On a phone the navigation is one row that scrolls.
+function showTab() {
+  const tab = $("nav").querySelector("[aria-current]");
+  if (tab) $("nav").scrollTo({ left: tab.offsetLeft - 60 });
+}
+
 function showConnection(why = "not connected: is ibrobot ui running?") {
   say($("connection"), ui.connected ? "" : why);
   $("connection").classList.toggle("bad", !ui.connected);
@@ -164,6 +168,7 @@ function showRunning() {
 
 $("theme").addEventListener("click", switchTheme);
 window.addEventListener("hashchange", () => { showView(); $("main").focus(); });
+window.addEventListener("resize", showTab);
 window.addEventListener("focus", () => shown?.show?.(true, address()[1]));
 ui.session = await ui.get("session");
 say($("folder"), ui.session.folders.join(" · "));

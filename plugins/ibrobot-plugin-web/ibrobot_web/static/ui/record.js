@@ -77,6 +77,10 @@ export class View {
   }
 
   job(job) {
-    if (this.sessions.update(job) && job.state !== "running") this.place();
+    const card = this.sessions.update(job);
+    if (!card || job.state === "running") return;
+    this.place();
+    if (card.ended !== job.state) card.element.scrollIntoView({ block: "nearest" }); // with the next steps
+    card.ended = job.state;
   }
 }
