@@ -185,7 +185,7 @@ def list_what_was_not_tested() -> None:
 def installation(page: str) -> list[str]:
     """What the first `$ pip install` of a page's console blocks installs, and the commands after it in that block."""
     text = Path(page).read_text(encoding="utf-8")
-    block = re.search(r"^```console\n\$ pip install \"?(ibrobot\S*?)\"?\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    block = re.search(r"^```console\n\$ pip install (?:--find-links dist )?\"?(ibrobot\S*?)\"?\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     if block is None:
         raise ValueError(f"{page}: no console block begins with `$ pip install ibrobot…`")
     return [block[1], *re.findall(r"^\$ (.*)$", block[2], re.MULTILINE)]

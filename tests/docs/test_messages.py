@@ -58,6 +58,8 @@ REMEDIES = {
     "test_an_arm_is_calibrated_in_the_dialogue_and_the_former_file_is_kept",
     "ibrobot feetech calibrate --name X": f"{_FEETECH}/test_commands.py::"
     "test_the_command_that_a_missing_calibration_names_makes_it",
+    "ibrobot feetech calibrate X --name X": f"{_FEETECH}/test_commands.py::"
+    "test_the_command_that_a_missing_calibration_names_makes_it",
     "ibrobot feetech check": f"{_FEETECH}/test_commands.py::test_drift_is_reported_and_written_back",
     "ibrobot feetech check X --name X --write": f"{_FEETECH}/test_commands.py::"
     "test_a_servo_that_dies_while_being_written_leaves_a_state_that_check_repairs",

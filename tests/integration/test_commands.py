@@ -374,11 +374,11 @@ def test_config_check_names_a_missing_calibration(
     found, out, err = terminal.run("config", "check", "so101", *deep)
     lines = [line for line in (out + err).splitlines() if "there is no such calibration" in line]
     assert found == code
-    parts = {"hardware": "so101_follower", "teleoperation.leader": "so101_leader"}
-    for line, (part, name) in zip(lines, parts.items(), strict=True):
+    parts = {"hardware": ("/dev/ttyACM0", "so101_follower"), "teleoperation.leader": ("/dev/ttyACM1", "so101_leader")}
+    for line, (part, (port, name)) in zip(lines, parts.items(), strict=True):
         assert line.startswith(begin)
         assert f" {part}: " in line
-        assert f"`ibrobot feetech calibrate --name {name}` makes one" in line
+        assert f"`ibrobot feetech calibrate {port} --name {name}` makes one" in line
 
 
 def calibration_of(ranges: dict[str, tuple[int, int]]) -> str:

@@ -198,8 +198,9 @@ def companion_path(path: Path) -> Path:
 
 
 def load_calibration(
-    name: str | Path, joints: Sequence[str] | None = None, *, zero_at: str | None = None, tool: str | None = None
-) -> Calibration:
+    name: str | Path, joints: Sequence[str] | None = None, *, zero_at: str | None = None, tool: str | None = None,
+    device: str = "",
+) -> Calibration:  # fmt: skip
     """Load a calibration: LeRobot's JSON (motor -> numbers) or IB-Robot's (servo id -> numbers).
 
     The companion file gives the position of 0 rad. A file without one comes from another program: in LeRobot 0 is the
@@ -212,12 +213,13 @@ def load_calibration(
         zero_at: position of 0 rad, one of `ZERO_AT`; overrides the companion file, whose hash is then not checked.
         tool: the command that has `calibrate` and `import` for this hardware, for error messages, e.g.
             `ibrobot my_arm`.
+        device: what that command takes to reach the hardware, e.g. a port; empty: nothing.
 
     Raises:
         CalibrationError: if it is missing or invalid; names file, joint, key, value and the valid values.
     """
     path = calibration_path(name)
-    text, document = _document(path, tool)
+    text, document = _document(path, tool, device)
     if not isinstance(document, dict) or not document:
         raise CalibrationError(f"{path}: must be an object of joints, each with {_KEYS}")
     numbered = all(key.isdigit() for key in document)
@@ -241,7 +243,7 @@ def load_calibration(
     return loaded if zero_at is None else loaded.with_zero_at(zero_at)
 
 
-def _document(path: Path, tool: str | None = None) -> tuple[str, Any]:
+def _document(path: Path, tool: str | None = None, device: str = "") -> tuple[str, Any]:
     try:
         text = path.read_text()
         return text, json.loads(text, object_pairs_hook=_once)
@@ -250,6 +252,8 @@ def _document(path: Path, tool: str | None = None) -> tuple[str, Any]:
         if tool:
             name = path.stem if path == calibration_path(path.stem) else path
             remedy = f"`{tool} calibrate --name {name}` makes one"
+            if device:
+                remedy = f"`{tool} calibrate {device} --name {name}` makes one"
         raise CalibrationError(f"{path}: there is no such calibration; {remedy}") from None
     except json.JSONDecodeError as error:
         raise CalibrationError(f"{path}:{error.lineno}: not JSON: {error.msg}") from None

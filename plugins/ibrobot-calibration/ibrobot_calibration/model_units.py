@@ -41,8 +41,8 @@ def _faults(config: RobotConfig, path: str, options: Options, joints: Sequence[s
         return
     limits = {joint.name: (joint.lower, joint.upper) for joint in config.robot.joints}
     try:
-        load_calibration(options.calibration, joints, tool=options.calibrated_by).check_ranges(
-            limits, config.closed_ends
-        )
+        device = next(iter(options.devices().values()), "")
+        calibration = load_calibration(options.calibration, joints, tool=options.calibrated_by, device=device)
+        calibration.check_ranges(limits, config.closed_ends)
     except CalibrationError as error:
         yield Problem(config.source, 0, path, str(error))

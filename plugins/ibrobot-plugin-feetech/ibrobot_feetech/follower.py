@@ -78,7 +78,7 @@ class FeetechFollower(Hardware):
         for fault in options.check(ctx.robot, ctx.joints):
             raise HardwareError(f"{ctx.name}: {fault.option[0]}: {fault.message}")
         try:
-            calibration = load_calibration(options.calibration, ctx.joints, tool=TOOL)
+            calibration = load_calibration(options.calibration, ctx.joints, tool=TOOL, device=options.port)
         except IbrobotError as error:
             if options.port.startswith(("/dev/", BY_SERIAL)) or calibration_path(options.calibration).exists():
                 raise

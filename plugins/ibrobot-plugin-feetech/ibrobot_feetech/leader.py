@@ -62,7 +62,7 @@ class LeaderTeleop(Teleop):
         self._leader_joints = tuple(pairs)
         self._joints = tuple(pairs.values())
         self._check_names("joints", self._joints, robot.joint_names)
-        calibration = load_calibration(options.calibration, self._leader_joints, tool=TOOL)
+        calibration = load_calibration(options.calibration, self._leader_joints, tool=TOOL, device=options.port)
         for option, names in (("inverted", options.inverted), ("scaled", options.scaled)):
             self._check_names(option, names, tuple(calibration.joints))
         self._arm = Arm(self._leader_joints, calibration)

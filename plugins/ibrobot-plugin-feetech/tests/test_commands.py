@@ -156,10 +156,10 @@ def test_an_arm_is_calibrated_in_the_dialogue_and_the_former_file_is_kept(emulat
 @pytest.mark.parametrize("name", ["so101_follower", "so101_leader"])
 def test_the_command_that_a_missing_calibration_names_makes_it(emulator, person, home, name):
     with pytest.raises(CalibrationError) as missing:
-        load_calibration(name, JOINTS, tool=TOOL)
+        load_calibration(name, JOINTS, tool=TOOL, device=emulator.port)
     (command,) = re.findall(r"`ibrobot (.*?)`", str(missing.value))
     gripper_of_a_leader = {6: (1400, 1700)} if name == "so101_leader" else {}  # hardly half the follower's range
-    with Terminal(*command.split(), emulator.port, "--middle-now") as terminal:
+    with Terminal(*command.split(), "--middle-now") as terminal:
         terminal.wait_for("(Enter ends it)")
         person.sweep(ENDS | gripper_of_a_leader)
         terminal.type("\r")

@@ -53,7 +53,8 @@ def check() -> Check:
     """The line of `ibrobot doctor`."""
     name, version = "LeRobot's version", installed()
     if version is None:
-        return Check(name, False, "not installed; training and policies need it", INSTALL, matters=False)
+        remedy = how_to_install("lerobot[dataset,training]")
+        return Check(name, False, "not installed; training and policies need it", remedy, matters=False)
     alike = tested(version)
     if alike is None:
         return Check(name, False, f"{untested(version)}; it is tried nevertheless", INSTALL, matters=False)

@@ -87,8 +87,8 @@ class GuideDescriptor(Descriptor[Any]):
 
 def installed_guides() -> list[GuideDescriptor]:
     """The guides of all plugins, in their order."""
-    found = [each for each in installed_plugins().of_kind("guide") if isinstance(each, GuideDescriptor)]
-    return sorted(found, key=lambda each: each.order)
+    guides = [each for each in installed_plugins().of_kind("guide") if isinstance(each, GuideDescriptor)]
+    return sorted(guides, key=lambda each: each.order)
 
 
 @attrs.frozen
