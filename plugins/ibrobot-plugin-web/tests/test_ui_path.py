@@ -41,11 +41,11 @@ def look_on_a_phone(page: Any) -> None:
     places = page.locator("#nav a").evaluate_all("(links) => links.map((each) => each.getBoundingClientRect().top)")
     assert max(places) - min(places) < 1
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
-    row = page.locator("#main tbody tr").first
+    row = page.get_by_role("link", name="episode_000001").locator("xpath=ancestor::tr")
     cells = row.evaluate("(each) => [...each.cells].map((cell) => getComputedStyle(cell).display)")
     assert set(cells) == {"block"}
     named = row.locator("td").evaluate_all("(cells) => cells.map((each) => getComputedStyle(each, '::before').content)")
-    assert '"Outcome" ": "' in named
+    assert '"Outcome: "' in named
 
 
 def test_from_a_robot_to_its_dataset_by_clicks_alone(tmp_path: Path) -> None:
