@@ -76,21 +76,16 @@ class NewPlugin:
     def show(self, made: dict[str, Any]) -> None:
         """Print what comes next."""
         echo(f"{made['folder']}: {len(made['files'])} files")
-<<<<<<< HEAD
         if made["entered"]:
             echo(f"entered in {', '.join(made['entered'])}")
             echo("next: uv sync --group cluster && uv run python tests/house/official_plugins.py")
             lists = "tests/test_distributions.py tests/docs/test_entrances_listed.py"
             echo(f"then: uv run pytest {made['folder']}/tests {lists}")
             return
-        echo(f'next: cd {made["folder"]} && pip install -e ".[test]" && pytest')
-        echo("then: the command at the top of its robot YAML")
-=======
         here = Path(sys.executable)
         python = "python" if Path(shutil.which("python") or "").parent == here.parent else shlex.quote(str(here))
         echo(f"next: cd {made['folder']} && {how_to_install('-e', '.[test]')} && {python} -m pytest")
-        echo(f"then: ibrobot launch {self.name}.yaml --sim --headless --duration 2")
->>>>>>> afa4d2bc (Remedies of the kit name the installer of their environment; a test finds those that do not)
+        echo("then: the command at the top of its robot YAML")
 
 
 def render(kind: str, name: str, *, outside: bool = True) -> dict[str, str]:
