@@ -9,7 +9,7 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
-from hypothesis import Phase, given, settings
+from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 from ibrobot_kinematics import (
     KinematicModel,
@@ -342,6 +342,11 @@ def region(model: KinematicModel, room: float = 0.04) -> tuple[float, ...]:
     return (*(here - room).tolist(), *(here + room).tolist())
 
 
+TOWARDS_THE_POINT = [(np.array([0, 0.285, 0]), STILL, False, 0.25), (np.array([0.57, 0, 0]), STILL, True, 0.25)]
+"""The nearer the point, the faster its direction turns."""
+
+
+@example(orders=TOWARDS_THE_POINT, kind="view")
 @settings(deadline=None, max_examples=15, phases=[Phase.explicit, Phase.generate])
 @given(orders=st.lists(commands, min_size=1, max_size=6), kind=st.sampled_from(["upright", "region", "view", "all"]))
 def test_no_twist_breaks_a_path_constraint_or_a_limit(orders, kind):

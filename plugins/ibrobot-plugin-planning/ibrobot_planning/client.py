@@ -28,7 +28,8 @@ from ibrobot_planning.execution.results import MoveResult
 from ibrobot_planning.execution.source import EXECUTE
 
 type GoalKeys = Mapping[str, Any]
-"""A goal as plain data: `pose`, `joints` [rad], or `xyz` [m] with `axis`, `rpy` or `quaternion`; see `GoalOptions`."""
+"""A goal as plain data: `pose`, `joints` [rad], or `xyz` [m] with `axis`, `rpy` or `quaternion`, each also with
+`path_constraints`; see `GoalOptions`."""
 
 _DEFAULT = "connect=[tcp/127.0.0.1:7447]"
 _TIMEOUT_S = 60.0
@@ -155,9 +156,12 @@ class Client:
         return self._planned(service, **request, start=start, **scalings)
 
     def plan_straight(
-        self, *waypoints: GoalKeys, start: Mapping[str, float] | None = None, **more: float
+        self, *waypoints: GoalKeys, start: Mapping[str, float] | None = None, **more: Any
     ) -> JointTrajectory:
-        """Plan straight lines through `xyz`; `least_fraction` of the way must be possible, by default all."""
+        """Plan straight lines through `xyz`; `least_fraction` of the way must be possible, by default all.
+
+        `path_constraints` hold on the whole line, e.g. {"upright": 0.17}.
+        """
         return self._planned("/compute_cartesian_path", waypoints=waypoints, start=start, **more)
 
     def follow(self, trajectory: JointTrajectory) -> Motion:

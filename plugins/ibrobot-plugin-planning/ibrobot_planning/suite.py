@@ -10,6 +10,7 @@ from typing import Any, ClassVar, override
 import attrs
 import numpy as np
 import pytest
+from ibrobot_kinematics import PathConstraints
 from ibrobot_testing.suite import Suite
 
 from ibrobot_core.api import (
@@ -24,7 +25,7 @@ from ibrobot_core.api import (
     seconds,
 )
 from ibrobot_core.app import Guard, PlanCode
-from ibrobot_planning.planner import JointGoal, Planner, PlanRequest, PlanResult
+from ibrobot_planning.planner import ConstrainedGoal, JointGoal, Planner, PlanRequest, PlanResult
 
 
 class PlannerSuite(Suite[Planner]):
@@ -142,6 +143,15 @@ class PlannerSuite(Suite[Planner]):
             ):
                 with pytest.raises(PlanningError):
                     planner.plan(attrs.evolve(request, goal=goal))
+
+    def test_overlooks_no_path_constraint(self) -> None:
+        """A goal with constraints that no robot keeps is a PlanningError, whether the planner knows them or not."""
+        with self.loaded() as (planner, ctx):
+            request = self.request(ctx, 9)
+            assert isinstance(request.goal, JointGoal)
+            far = PathConstraints(region=(1e3, 1e3, 1e3, 2e3, 2e3, 2e3))
+            with pytest.raises(PlanningError):
+                planner.plan(attrs.evolve(request, goal=ConstrainedGoal(request.goal, far)))
 
     def test_leaves_the_request_alone(self) -> None:
         """`plan` changes nothing in its request."""

@@ -496,6 +496,18 @@ def test_poses_on_the_axis_of_the_base_are_planned_or_refused(run, policy: str, 
         assert "Error" not in answer.message
 
 
+def test_inverse_kinematics_keeps_path_constraints(run):
+    bus = run().session.bus
+    goal = {"xyz": [0.2, 0.05, 0.1], "path_constraints": {"upright": 0.1, "upright_axis": "-z"}}
+    answer = bus.call(COMPUTE_IK, {"goal": goal})
+    joints = dict(zip(answer.joint_state.name, answer.joint_state.position.tolist(), strict=True))
+    turned = bus.call(COMPUTE_FK, {"joints": joints}).poses[0].pose.orientation
+    assert np.arccos(2 * (turned.x**2 + turned.y**2) - 1) <= 0.1
+    ahead = bus.call(COMPUTE_IK, {"goal": {**goal, "xyz": [0.27, 0.0675, 0.12], "axis": [1, 0.25, 0]}})
+    assert ahead.code is PlanCode.GOAL_VIOLATES_PATH_CONSTRAINTS
+    assert "no configuration at the position keeps it" in ahead.message
+
+
 def test_goals_of_services_have_the_keys_of_task_files(start, tmp_path):
     """One grammar: relative to an object, relative to the tool, a direction by its name."""
     cup = "world: {objects: {cup: {shape: sphere, radius: 0.02, position: [0.2, 0.1, 0.05]}}}\n"

@@ -7,7 +7,7 @@ from typing import override
 import attrs
 import numpy as np
 import pytest
-from ibrobot_planning.planner import JointGoal, PlanResult
+from ibrobot_planning.planner import ConstrainedGoal, JointGoal, PlanResult
 from ibrobot_planning.suite import FakePlanner, PlannerSuite
 from ibrobot_testing import checks, failed_checks
 
@@ -99,6 +99,12 @@ class IgnoresUnknownJoints(FakePlanner):
         return super().plan(attrs.evolve(request, goal=JointGoal(known, request.goal.positions[: len(known)])))
 
 
+class OverlooksConstraints(FakePlanner):
+    def plan(self, request):
+        goal = request.goal.goal if isinstance(request.goal, ConstrainedGoal) else request.goal
+        return super().plan(attrs.evolve(request, goal=goal))
+
+
 class ChangesTheRequest(FakePlanner):
     def plan(self, request):
         trajectory = super().plan(request).trajectory
@@ -132,6 +138,7 @@ WRONG = {
     NoPointsWithoutAWay: "no_way_to_go_is_a_trajectory_too",
     ClampsTheGoal: "refuses_a_goal_outside_the_limits",
     IgnoresUnknownJoints: "refuses_an_impossible_goal",
+    OverlooksConstraints: "overlooks_no_path_constraint",
     ChangesTheRequest: "leaves_the_request_alone",
     BlocksItself: "nothing_blocks_its_own_trajectory",
     ClosesOnce: "close_is_safe_twice",

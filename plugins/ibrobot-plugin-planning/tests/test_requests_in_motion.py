@@ -193,6 +193,11 @@ def some(**keys: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
 
 
 POLICIES = st.sampled_from(["refuse", "nearest", "keep_axis", "arm_plane", "current", "free", "no"])
+SIX = st.lists(NUMBERS, min_size=5, max_size=7)
+AXIS = st.one_of(st.sampled_from(["x", "-z", "up"]), THREE)
+CONSTRAINTS = some(
+    upright=NUMBERS, upright_axis=AXIS, region=SIX, view=THREE, view_angle=NUMBERS, view_axis=AXIS, view_from=THREE
+)
 GOAL = some(
     pose=NAMES,
     joints=JOINT_VALUES,
@@ -204,8 +209,17 @@ GOAL = some(
     position_tolerance=NUMBERS,
     angle_tolerance=NUMBERS,
     beyond_reach=POLICIES,
+    path_constraints=CONSTRAINTS,
 )
-TOOL = st.fixed_dictionaries({"xyz": st.tuples(NUMBERS, NUMBERS, NUMBERS).map(list)}, optional={"axis": THREE})
+KEPT = st.one_of(
+    st.fixed_dictionaries({"upright": st.floats(0.01, 3)}),
+    st.fixed_dictionaries({"region": st.just([-1, -1, -1, 1, 1, 1])}, optional={"upright": st.floats(0.01, 3)}),
+    st.fixed_dictionaries({"view": st.lists(st.floats(-2, 2), min_size=3, max_size=3)}, optional={"view_axis": AXIS}),
+)
+TOOL = st.fixed_dictionaries(
+    {"xyz": st.tuples(NUMBERS, NUMBERS, NUMBERS).map(list)},
+    optional={"axis": THREE, "path_constraints": st.one_of(KEPT, KEPT, CONSTRAINTS)},
+)
 GOALS = st.one_of(GOAL, TOOL)
 SCALINGS = {"velocity_scaling": NUMBERS, "acceleration_scaling": NUMBERS}
 OBJECT = some(
@@ -227,8 +241,12 @@ POINT = st.fixed_dictionaries(
     optional={"velocities": st.lists(NUMBERS, min_size=4, max_size=5)},
 )
 WORDS = st.sampled_from(
-    ["xyz=1e308,0,0", "xyz=0.2,0,0.1 axis=1e300,0,0", "pan=0.2", "left", "xyz=0.2,0.05,0.1", "rpy=1"]
-)
+    [
+        "xyz=1e308,0,0", "xyz=0.2,0,0.1 axis=1e300,0,0", "pan=0.2", "left", "xyz=0.2,0.05,0.1", "rpy=1",
+        "left upright=2.5", "pan=0.1 region=-1,-1,-1,1,1,1", "xyz=0.2,0,0.1 view=0,0,0 view_angle=3",
+        "up upright=1e-300",
+    ]
+)  # fmt: skip
 POSE = some(
     position=some(x=NUMBERS, y=NUMBERS, z=NUMBERS), orientation=some(x=NUMBERS, y=NUMBERS, z=NUMBERS, w=NUMBERS)
 )
@@ -241,7 +259,11 @@ REQUESTS: dict[Service[Any, Any] | str, st.SearchStrategy[Any]] = {
     "/compute_fk": some(joints=JOINT_VALUES, links=st.lists(NAMES, max_size=2)),
     "/plan_kinematic_path": some(goals=st.lists(GOALS, max_size=2), start=JOINT_VALUES, **SCALINGS),
     "/compute_cartesian_path": some(
-        waypoints=st.lists(GOALS, max_size=2), least_fraction=NUMBERS, start=JOINT_VALUES, **SCALINGS
+        waypoints=st.lists(GOALS, max_size=2),
+        least_fraction=NUMBERS,
+        start=JOINT_VALUES,
+        path_constraints=CONSTRAINTS,
+        **SCALINGS,
     ),
     "/planning/plan": WORDS,
     "/get_planning_scene": st.none(),

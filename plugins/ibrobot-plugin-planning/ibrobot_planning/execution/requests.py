@@ -63,7 +63,9 @@ class PlanQuery(MoveRequest):
 class GoTo:
     """A request to `/planning/go_to`."""
 
-    goal: str | Goal | Target = option(plain=str, help="a pose's name, joints, or a position of the tool, as `--goal`")
+    goal: str | Goal | Target = option(
+        plain=str, help="a pose's name, joints, or a position of the tool, and path constraints, as `--goal`"
+    )
 
 
 @documented

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import attrs
 import numpy as np
+from ibrobot_kinematics import ToolConstraints
 
 from ibrobot_core.api import Header, IbrobotError, JointState, PlanningError, PoseStamped, Vector
 from ibrobot_core.app import ControlMode, NoRequest, PlanCode, RunView, Service
@@ -145,7 +146,10 @@ class PlanningServices:
         try:
             start = self._start(query.start)
             goal = query.goal.tool_goal(*self._plans.surroundings((query.goal,), start))
-            candidates = self._plans.tool.candidates(goal, start)
+            tool = self._plans.tool
+            candidates = tool.candidates(goal, start)
+            if (given := query.goal.path_constraints) is not None:
+                candidates = tool.kept(goal, candidates, ToolConstraints(given, tool.model, start), start)
             if query.avoid_collisions:
                 candidates = self._free(candidates)
         except PlanningError as error:

@@ -21,9 +21,10 @@ from ibrobot_kinematics.poses import matrix
 from ibrobot_kinematics.rotations import between, cross, log
 from ibrobot_kinematics.search import TABLE_LEVER_M, search, starts_from_table
 
-from ibrobot_core.api import Vector, Vector3
+from ibrobot_core.api import PlanningError, Vector, Vector3
+from ibrobot_core.app import PlanCode
 from ibrobot_planning.goals.errors import invalid_goal, unreachable
-from ibrobot_planning.planner import PoseGoal, PositionGoal
+from ibrobot_planning.planner import Goal, PoseGoal, PositionGoal
 
 _PITCHES = np.linspace(-np.pi / 2, np.pi / 2, 7)
 """Directions of the tool that are tried if a goal has none: from straight down to straight up."""
@@ -39,6 +40,8 @@ _FAR = 10.0
 """Positions farther than this many times the arm's reach are refused at once."""
 _WIDEST = 100.0
 """Larger tolerances [m or rad] are refused."""
+HELD_BACK = 1e-6
+"""What checks hold back from every tolerance of a path constraint [rad or m]: another engine may round otherwise."""
 _NEAR_POSITION, _SEEDS = 400, 60
 """Configurations near a position, and how many of them, the nearest to constraints, are projected onto these."""
 _NEARLY_ONE = 1e-3
@@ -138,7 +141,34 @@ class Tool:
         met = [each for each in candidates if each.orientation_error <= goal.orientation_tolerance]
         return met or self._beyond(goal, position, rotation, start, candidates)
 
-    def keeping(
+    def kept(
+        self, goal: Goal, candidates: Sequence[Candidate], constraints: ToolConstraints, start: Vector
+    ) -> list[Candidate]:
+        """The configurations that keep path constraints; for a position, also others that do.
+
+        Args:
+            goal: the goal.
+            candidates: configurations that reach it.
+            constraints: the constraints.
+            start: positions of all joints of the model [rad], shape (J,).
+
+        Raises:
+            PlanningError: if there are none, with the least excess.
+        """
+        nowhere = ""
+        if isinstance(goal, PositionGoal | PoseGoal):
+            candidates = [*candidates, *self._keeping(goal, candidates, constraints, start)]
+            nowhere = "; no configuration at the position keeps it"
+        kept = [each for each in candidates if constraints.kept(each.joints, -HELD_BACK)]
+        if kept:
+            return kept
+        least = min(candidates, key=lambda each: float(constraints.excess(each.joints).max()))
+        raise PlanningError(
+            f"the goal breaks {constraints.broken(least.joints, -HELD_BACK)}{nowhere}",
+            PlanCode.GOAL_VIOLATES_PATH_CONSTRAINTS,
+        )
+
+    def _keeping(
         self, goal: PositionGoal | PoseGoal, near: Sequence[Candidate], constraints: ToolConstraints, start: Vector
     ) -> list[Candidate]:
         """Configurations at the position of a goal that keep path constraints, the nearest to `start` first.

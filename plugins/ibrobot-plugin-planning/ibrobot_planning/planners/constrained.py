@@ -15,11 +15,10 @@ import numpy as np
 from ibrobot_kinematics import ToolConstraints
 
 from ibrobot_core.api import Vector
+from ibrobot_planning.goals.tool import HELD_BACK
 from ibrobot_planning.planners.search import Space
 from ibrobot_planning.world.collision import Collisions, Contact
 
-ROUNDING = 1e-6
-"""What the checks hold back from every tolerance [rad or m]: another engine may round otherwise."""
 _STEP = 0.2
 """Distance of the points of a projected line [rad]."""
 _TEAR = 3.0
@@ -64,7 +63,7 @@ class ConstrainedChecks:
 
     def first_broken(self, configurations: Vector) -> int:
         """Number of configurations, shape (N, J), before the first that breaks a constraint."""
-        return self.constraints.first_broken(self.whole(configurations), -ROUNDING)
+        return self.constraints.first_broken(self.whole(configurations), -HELD_BACK)
 
     def first_hit(self, configurations: Vector) -> int:
         """Number of configurations, shape (N, J), before the first that is not free."""
@@ -86,7 +85,7 @@ class ConstrainedChecks:
 
     def broken(self, q: Vector) -> str:
         """In words, the constraint that `q`, shape (J,), breaks; empty if it keeps all."""
-        return self.constraints.broken(self.whole(q), -ROUNDING)
+        return self.constraints.broken(self.whole(q), -HELD_BACK)
 
 
 @attrs.frozen(eq=False)

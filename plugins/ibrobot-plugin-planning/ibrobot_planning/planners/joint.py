@@ -41,7 +41,7 @@ class JointPlanner(Planner):
         start, order = checked_start(request, self._robot), self._robot.indices(request.joints)
         if not isinstance(request.goal, JointGoal | NamedGoal):
             raise PlanningError(
-                "planner type 'joint' knows joint goals only, not poses of the tool: "
+                "planner type 'joint' knows joint goals only, not poses of the tool, nor path constraints: "
                 "name a pose of robot.description.poses, or use another type of planner, one for Cartesian goals",
                 PlanCode.UNRECOGNIZED_GOAL_TYPE,
             )

@@ -29,7 +29,7 @@ from ibrobot_planning.planner import (
     PoseGoal,
     PositionGoal,
 )
-from ibrobot_planning.planners.constrained import ROUNDING, ConstrainedChecks, ConstrainedSpace
+from ibrobot_planning.planners.constrained import ConstrainedChecks, ConstrainedSpace
 from ibrobot_planning.planners.linear import linear_path
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.paths import CHECK_S, FreePaths, collisions, outwards, sentence
@@ -267,8 +267,9 @@ class _Plan:
         Raises:
             PlanningError: if all of them touch something.
         """
-        if self._constraints is not None:
-            candidates = self._keeping(self._constraints, candidates, goal)
+        tolerant = isinstance(goal, JointGoal) and goal.tolerance > 0
+        if self._constraints is not None and not tolerant:
+            candidates = self.tool.kept(goal, candidates, self._constraints, self._whole())
         free = [candidate for candidate in candidates if self.checks.free(candidate.joints[self._order])]
         if not free and isinstance(goal, JointGoal) and goal.tolerance > 0:
             free = self._nearby(candidates[0].joints, goal)
@@ -280,24 +281,6 @@ class _Plan:
         )
         at_all = f" in all of its {len(candidates)} configurations" if len(candidates) > 1 else ""
         raise PlanningError(f"the goal is in collision{at_all}: {sentence(least)}", PlanCode.GOAL_IN_COLLISION)
-
-    def _keeping(self, constraints: ToolConstraints, candidates: list[Candidate], goal: Goal) -> list[Candidate]:
-        """The configurations that keep the path constraints, and others at the same position.
-
-        Raises:
-            PlanningError: if there are none, with the least excess.
-        """
-        if isinstance(goal, PositionGoal | PoseGoal):
-            candidates = [*candidates, *self.tool.keeping(goal, candidates, constraints, self._whole())]
-        kept = [each for each in candidates if constraints.kept(each.joints, -ROUNDING)]
-        if kept or (isinstance(goal, JointGoal) and goal.tolerance > 0):
-            return kept or candidates
-        least = min(candidates, key=lambda each: float(constraints.excess(each.joints).max()))
-        nearest = "" if isinstance(goal, JointGoal | NamedGoal) else "; no configuration at the position keeps it"
-        raise PlanningError(
-            f"the goal breaks {constraints.broken(least.joints, -ROUNDING)}{nearest}",
-            PlanCode.GOAL_VIOLATES_PATH_CONSTRAINTS,
-        )
 
     def _nearby(self, whole: Vector, goal: JointGoal) -> list[Candidate]:
         """The nearest of random free configurations within the goal's tolerance."""
