@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from ibrobot_testing import host_context
 
-from ibrobot_core.descriptors import Options
-from ibrobot_core.errors import ContractError, NotSupported, PluginError
+from ibrobot_core.descriptors import Options, ReaderDescriptor
+from ibrobot_core.errors import ContractError, NotSupported, PluginError, RecorderError
 from ibrobot_core.messages import CompressedImage, Header
 from ibrobot_core.plugins import KINDS, Registry, discover
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from ibrobot_testing.site import Site
 
 
@@ -247,3 +249,10 @@ def test_the_listing_imports_nothing_heavy() -> None:
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
 
     assert ran.stdout.splitlines()[-1] == "heavy: []"
+
+
+def test_single_episode_has_no_number(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").touch()
+    reader = ReaderDescriptor("log", "a log", reads=lambda path: True, make=lambda address: pytest.fail("it was read"))
+    with pytest.raises(RecorderError, match=r"log.csv:3: .*log.csv is a single episode; leave :3 out"):
+        Registry(readers=[reader]).open_episode(tmp_path / "log.csv:3")

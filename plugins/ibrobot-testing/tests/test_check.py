@@ -70,14 +70,23 @@ def test_good_package_fails_nothing_and_says_what_was_not_run(site: Site, capsys
 @pytest.mark.parametrize(
     ("old", "new", "name", "message"),
     [
-        ('"wave"', '"my wave"', "discovery", "type 'my wave' is not a name"),
-        ("import attrs\n", "import attrs, numpy\n", "weight", "fake_wave imports numpy"),
+        ('"wave"', '"my wave"', "discovery",
+         "type 'my wave' is not a name: use letters, digits and _, e.g. my_arm; "
+         "nothing, or not all, of what it offers is used"),
+        ("import attrs\n", "import attrs, numpy\n", "weight",
+         'fake_wave imports numpy; each ibrobot command imports that: import it in `make`, e.g. by Late("MODULE:NAME'),
         ("import attrs\n", "import attrs\nimport sys\nif sys.argv[0] == '-c': raise OSError('no port')\n", "weight",
          "fake_wave cannot be imported alone: OSError: no port"),
-        (', help="how fast"', "", "teleop wave", "options without help: gain"),
-        (':FakeTeleop")', ':Nobody")', "teleop wave", "ibrobot_testing.fakes.host:Nobody cannot be imported"),
+        (', help="how fast"', "", "teleop wave",
+         "options without help: gain; ibrobot plugins show and forms show it: write help=…"),
+        (':FakeTeleop")', ':Nobody")', "teleop wave",
+         "ibrobot_testing.fakes.host:Nobody cannot be imported: module 'ibrobot_testing.fakes.host' has no attribute"),
+        (':FakeTeleop")', ':Nobody")', "teleop wave", "; name what is there"),
         ("ibrobot_testing.fakes.host:FakeTeleop", "ibrobot_core.api:Teleop", "teleop wave",
-         "Teleop lacks connect, disconnect, read"),
+         "Teleop lacks connect, disconnect, read; define these methods"),
+        ('"waves"', '""', "teleop wave", "it has no summary; lists of plugins show it"),
+        ("import attrs\n", "import attrs\nimport os, sys\nif sys.argv[0] == '-c': os._exit(3)\n", "weight",
+         "fake_wave cannot be imported alone: it ended without a word"),
     ],
 )  # fmt: skip
 def test_mistake_fails_with_its_cause(site: Site, old: str, new: str, name: str, message: str) -> None:
@@ -87,21 +96,25 @@ def test_mistake_fails_with_its_cause(site: Site, old: str, new: str, name: str,
         CheckPlugin("fake-wave")()
     wrong = [check for check in failed.value.result if check.matters and not check.ok]
     assert [check.name for check in wrong] == [name]
-    assert message in wrong[0].found
+    assert message in f"{wrong[0].found}; {wrong[0].remedy}"
 
 
 @pytest.mark.parametrize(
-    ("requires", "message", "fails"),
+    ("requires", "message", "remedy", "fails"),
     [
-        ("", "it does not require ibrobot-core", True),
-        ("ibrobot-core>=9,<10", "ibrobot-core<10,>=9; 0.1.0 is installed", True),
-        ("ibrobot-core>=0.1", "ibrobot-core>=0.1 permits all later versions", False),
+        ("", "it does not require ibrobot-core", 'add "ibrobot-core>=0.1,<0.2" to its dependencies', True),
+        ("ibrobot-core>=9,<10", "ibrobot-core<10,>=9; 0.1.0 is installed",
+         "install a version of ibrobot-core that it permits", True),
+        ("ibrobot-core>=0.1", "ibrobot-core>=0.1 permits all later versions",
+         "interfaces change between minor versions before 1.0: add an upper bound, e.g. <0.2", False),
     ],
-)
-def test_versions_that_do_not_fit_are_named(site: Site, requires: str, message: str, *, fails: bool) -> None:
+)  # fmt: skip
+def test_versions_that_do_not_fit_are_named(
+    site: Site, requires: str, message: str, remedy: str, *, fails: bool
+) -> None:
     install(site, requires=requires)
     check = checks()["versions"]
-    assert (check.ok, check.matters, check.found) == (False, fails, message)
+    assert (check.ok, check.matters, check.found, check.remedy) == (False, fails, message, remedy)
 
 
 def test_function_that_makes_the_object_is_listed_as_not_looked_at(site: Site) -> None:
@@ -127,9 +140,22 @@ def test_tests_of_the_source_are_run(site: Site, tmp_path: Path, monkeypatch: py
     check = checks()["tests"]
     assert not check.ok
     assert "1 failed" in check.found
+    assert check.remedy == f"cd {folder} && pytest"
     assert "not checked" not in checks()
     (folder / "tests/test_odd_one.py").write_text("def test_nothing(): pass\n")
-    assert checks()["tests"].found.endswith("has no conformance suite")
+    check = checks()["tests"]
+    assert check.found.endswith("has no conformance suite")
+    assert check.remedy == "subclass the suite of its kind, of ibrobot_testing"
+
+
+def test_tests_that_do_not_end_are_an_error(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(site)
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests/test_slow.py").write_text("import time\n\nclass TestSlow(Suite): pass\n\ntime.sleep(600)\n")
+    monkeypatch.setattr("ibrobot_kit.check._TESTS_S", 0.01)
+    as_source(site, tmp_path)
+    check = checks()["tests"]
+    assert (check.ok, check.found, check.remedy) == (False, "did not end within 0.01 s", f"cd {tmp_path} && pytest")
 
 
 def test_checks_that_need_a_hook_are_listed(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,6 +165,7 @@ def test_checks_that_need_a_hook_are_listed(site: Site, tmp_path: Path, monkeypa
     as_source(site, folder)
     check = checks()["not checked"]
     assert (check.found, check.matters) == ("the suite overrides no another, reference", False)
+    assert check.remedy == "how-to/test-a-plugin says what each makes the device do"
 
 
 @pytest.mark.parametrize(
@@ -157,11 +184,13 @@ def test_what_is_no_plugin_is_an_error(package: str, message: str) -> None:
     ("type_", "place", "text"),
     [
         ("skin_msgs/msg/Touch", "fake_wave:Touch", "fake_wave:Touch is there"),
-        ("sensor_msgs/msg/JointState", "fake_wave:JointState", "core has this type, so that yours is not used"),
-        ("skin_msgs/msg/Push", "fake_wave:Touch", "fake_wave:Touch is no message of type skin_msgs/msg/Push"),
+        ("sensor_msgs/msg/JointState", "fake_wave:JointState",
+         "core has this type, so that yours is not used; give it a name of its own"),
+        ("skin_msgs/msg/Push", "fake_wave:Touch",
+         "no message of type skin_msgs/msg/Push: <class 'fake_wave.Touch'>; name a class that is derived from Message"),
         ("skin_msgs/msg/Touch", "fake_wave:Tuch", "fake_wave:Tuch: module 'fake_wave' has no attribute 'Tuch'"),
     ],
-)
+)  # fmt: skip
 def test_message_types_are_checked(site: Site, type_: str, place: str, text: str) -> None:
     messages = f'''
 
@@ -182,5 +211,5 @@ def ibrobot_messages():
 '''
     install(site, PLUGIN + messages)
     check = checks()[f"message {type_}"]
-    assert text in check.found
+    assert text in f"{check.found}; {check.remedy}"
     assert check.ok == text.endswith("is there")

@@ -121,6 +121,12 @@ def test_folder_that_exists_is_left_as_it_is(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "ibrobot-plugin-wave").iterdir()] == ["mine.py"]
 
 
+def test_folder_that_is_a_file_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "here").write_text("mine")
+    with pytest.raises(RequestError, match=r"--out .*here: is not a folder"):
+        NewPlugin("teleop", "wave", tmp_path / "here")()
+
+
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
     """A checkout of the repository, as far as `new` looks at it."""
