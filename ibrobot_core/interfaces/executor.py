@@ -127,11 +127,11 @@ class Executor(ABC):
         """Release the joints; discard plans and goals."""
 
     def set_plan(self, plan: Plan) -> None:
-        """Replace the plan; only if `accepts_plans`. An invalid plan is counted, and the old one is kept."""
+        """Replace the plan; `update` meets each of its points in time. An invalid one is counted, the old one kept."""
         raise NotImplementedError(f"{type(self).__name__} accepts no plans")
 
     def set_goal(self, goal_id: str, goal: ExecutorGoal, measured: JointReading) -> None:
-        """Begin a goal; it replaces a present one without a step in the setpoint.
+        """Begin a goal; it replaces a present one without a step in the setpoint beyond `max_velocity`.
 
         Raises:
             GoalRejected: if it is wrong or this executor accepts no goals; the old goal continues.

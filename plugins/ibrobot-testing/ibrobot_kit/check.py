@@ -115,24 +115,35 @@ def _weight(module: str) -> Check:
 
 def _described(name: str, descriptor: Descriptor[Any]) -> Iterator[Check]:
     """What a descriptor says of its type."""
-    silent = [field.alias for field in attrs.fields(descriptor.options) if not field.metadata.get("help")]
+    options = attrs.fields(descriptor.options)
+    silent = [field.alias for field in options if not field.metadata.get("help")]
     remedy = "ibrobot plugins show and forms show it: write help=…"
-    yield Check(
-        name, not silent, f"options without help: {', '.join(silent)}" if silent else "options have help", remedy
-    )
+    if silent:
+        yield Check(name, False, f"options without help: {', '.join(silent)}", remedy)
+    else:
+        yield Check(name, True, "options have help" if options else "it has no options")
     if not descriptor.summary:
         yield Check(name, False, "it has no summary", "lists of plugins show it")
-    if not isinstance(descriptor.make, Late):
+    places = _places(descriptor.make)
+    if not places:
         yield Check(name, False, "make is a function: what it makes was not looked at", matters=False)
-        return
-    try:
-        made: Any = descriptor.make.load()
-    except Exception as error:  # noqa: BLE001 - whatever the plugin raises
-        yield Check(name, False, f"{descriptor.make.place} cannot be imported: {error}", "name what is there")
-        return
-    lacking = sorted(made.__abstractmethods__) if inspect.isabstract(made) else []
-    text = f"{made.__name__} lacks {', '.join(lacking)}" if lacking else f"{descriptor.make.place} is there"
-    yield Check(name, not lacking, text, "define these methods")
+    for late in places:
+        try:
+            made: Any = late.load()
+        except Exception as error:  # noqa: BLE001 - whatever the plugin raises
+            yield Check(name, False, f"{late.place} cannot be imported: {error}", "name what is there")
+            continue
+        lacking = sorted(made.__abstractmethods__) if inspect.isabstract(made) else []
+        text = f"{made.__name__} lacks {', '.join(lacking)}" if lacking else f"{late.place} is there"
+        yield Check(name, not lacking, text, "define these methods")
+
+
+def _places(make: Any) -> list[Late]:
+    """The places that `make` is or, as a function, uses: `lambda options, ctx: make(ctx)`."""
+    if isinstance(make, Late):
+        return [make]
+    used = inspect.getclosurevars(make).nonlocals.values() if inspect.isfunction(make) else ()
+    return [each for each in used if isinstance(each, Late)]
 
 
 def _message(descriptor: MessageDescriptor) -> Check:

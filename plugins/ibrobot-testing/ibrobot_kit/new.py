@@ -162,7 +162,7 @@ def render(kind: str, name: str, *, outside: bool = True) -> dict[str, str]:
     files = {
         "pyproject.toml": "pyproject.toml", "README.md": "README.md", "module.py": f"{own}/__init__.py",
         "implementation.py": f"{own}/{kind}.py", "test.py": f"tests/test_{name}.py", "robot.yaml": facts["robot_file"],
-        **({"ci.yml": ".github/workflows/test.yml"} if outside else {}),
+        **({"ci.yml": ".github/workflows/test.yml", "gitignore": ".gitignore"} if outside else {}),
     }  # fmt: skip
     facts["outside"] = outside
     made_files = {path: environment.get_template(f"{each}.jinja").render(facts) for each, path in files.items()}

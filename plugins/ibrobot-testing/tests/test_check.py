@@ -123,6 +123,16 @@ def test_function_that_makes_the_object_is_listed_as_not_looked_at(site: Site) -
     assert (check.found, check.matters) == ("make is a function: what it makes was not looked at", False)
 
 
+@pytest.mark.parametrize(("made", "found"), [("FakeTeleop", "is there"), ("Nobody", "cannot be imported")])
+def test_place_that_a_function_uses_is_looked_at(site: Site, made: str, found: str) -> None:
+    function = PLUGIN.replace('    yield TeleopDescriptor("wave", Late(', "    make = Late(")
+    function = function.replace(':FakeTeleop"), "waves", options=Given)', f':{made}")')
+    install(site, f'{function}    yield TeleopDescriptor("wave", lambda options, ctx: make(ctx), "waves")\n')
+    every = [check.found for check in examine("fake-wave", installed_plugins()) if check.name == "teleop wave"]
+    assert every[0] == "it has no options"
+    assert f"ibrobot_testing.fakes.host:{made} {found}" in every[1]
+
+
 def as_source(site: Site, folder: Path) -> None:
     """Let the package be installed from a folder, as by `pip install -e`."""
     facts = {"url": folder.as_uri(), "dir_info": {"editable": True}}
