@@ -4,12 +4,12 @@
 
 An SO-101, two of them, and a UR5 and an FR3 made from their URDFs, on a table. Five kinds of commands take turns (a
 policy, a leader, limits, twists, trajectories), most of them aimed at configurations in contact, while posts, bars,
-walls and cubes come, move and go. `commanded`: the safety layer with the guard; a tenth as many commands without it,
-for comparison. `simulated`: the whole of control with the simulated arm, a twentieth as many; also the way that the
-joints take. `appears`: an object appears on the way of a moving arm. `backs_out`: near objects or in contact, an
-operator drives joints out. Exits with 1 if a command leads into contact, a pair comes a millimetre nearer than its
-margin, a simulated arm touches, an arm comes nearer than by braking at once or says another distance than MuJoCo, or an
-operator does not come out.
+walls and cubes come, move and go. `commanded`: the safety layer with the guard; a tenth of these commands also go to an
+arm without it. `without`: a tenth as many, of commanders that begin where such an arm is. `simulated`: the whole of
+control with the simulated arm, a twentieth as many; also the way that the joints take. `appears`: an object appears on
+the way of a moving arm. `backs_out`: near objects or in contact, an operator drives joints out. Exits with 1 if a
+command leads into contact, a pair comes a millimetre nearer than its margin, a simulated arm touches, an arm comes
+nearer than by braking at once or says another distance than MuJoCo, or an operator does not come out.
 """
 
 from __future__ import annotations
@@ -82,6 +82,7 @@ def summed(came: list[tuple[str, str, Any, float]]) -> dict[str, Result]:
             f"{name:20} {each.commands:7} commands, {each.overruled:6} overruled, {each.changes:4} world changes,"
             f" {each.touched:6} touch; least {1e3 * each.least:8.3f} mm, beyond the margin {1e3 * each.kept:8.3f} mm"
             f" ({each.worst})"
+            + (f"; the same commands without the guard: {each.free_touched} of {each.free} touch" if each.free else "")
         )
     for arm in dict.fromkeys(arm for arm, *_ in came):
         times = [took_s for of, _, _, took_s in came if of == arm]
@@ -90,16 +91,24 @@ def summed(came: list[tuple[str, str, Any, float]]) -> dict[str, Result]:
 
 
 def came_to(pool: Any, todo: list[tuple[Path, str, str, int]], kind: str) -> list[tuple[str, str, Any, float]]:
-    """Run trials; what has come of them so far is printed after each hundred."""
-    came = []
+    """Run trials; what has come of them so far is printed after each twenty."""
+    came: list[tuple[str, str, Any, float]] = []
+    begun_s = time.monotonic()
     for each in pool.imap(trial, todo):
         came.append(each)
-        if len(came) % 100 == 0 and len(came) < len(todo):
-            results = [result for *_, result, _ in came if isinstance(result, Result)]
-            touched, least = sum(result.touched for result in results), min((r.kept for r in results), default=0.0)
-            wrong = sum(bool(result) for *_, result, _ in came if isinstance(result, str))
+        if len(came) % 20 == 0 and len(came) < len(todo):
+            so_far = Result()
+            for *_, result, _ in came:
+                for part in (result,) if isinstance(result, Result) else result if isinstance(result, tuple) else ():
+                    so_far.add(part)
+            wrong = [result for *_, result, _ in came if isinstance(result, str) and result]
             print(
-                f"{kind}: {len(came)} of {len(todo)}, {touched} touch, {1e3 * least:.3f} mm, {wrong} failed", flush=True
+                f"{kind}: {len(came)} of {len(todo)} in {time.monotonic() - begun_s:.0f} s; {so_far.commands} commands,"
+                f" {so_far.overruled} overruled, {so_far.changes} world changes, {so_far.touched} touch, least beyond"
+                f" the margin {1e3 * so_far.kept:.3f} mm; without the guard {so_far.free_touched} of {so_far.free}"
+                f" touch; {len(wrong)} failed",
+                *wrong[-3:],
+                flush=True,
             )
     return came
 
@@ -135,6 +144,7 @@ def main() -> int:
             continue
         each = sums[what]
         figures |= {what: each.commands, f"{what}_touch": each.touched}
+        figures |= {"free": each.free, "free_touch": each.free_touched} if each.free else {}
         if least is not None:
             problems += each.touched > 0 or each.kept < least
             figures[f"{what}_beyond_margin_mm"] = 1e3 * each.kept

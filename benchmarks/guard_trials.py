@@ -35,6 +35,8 @@ MARGIN_M, SELF_MARGIN_M, PRESS_M = 0.003, 0.001, 0.01
 SIZES = {"post": (0.03, 0.03, 0.4), "bar": (0.04, 0.3, 0.04), "wall": (0.02, 0.6, 0.4), "cube": (0.06, 0.06, 0.06)}
 """The objects; they come, move and go."""
 FAR_M = 50.0
+FREE = 10
+"""Of every so many seeds, the commands are also sent past the guard."""
 HANDS = ("gripper", "moving_jaw_so101_v1", "camera_mount")
 """Links of the SO-101 that may touch the table."""
 LOG = logging.getLogger("guard")
@@ -362,6 +364,10 @@ class Result:
     overruled: int = 0
     changes: int = 0
     worst: str = ""
+    free: int = 0
+    """The same commands that were also sent past the guard."""
+    free_touched: int = 0
+    """Those of them that touch."""
 
     def add(self, other: Result) -> None:
         """Count in what another one counted."""
@@ -369,6 +375,8 @@ class Result:
         self.touched += other.touched
         self.overruled += other.overruled
         self.changes += other.changes
+        self.free += other.free
+        self.free_touched += other.free_touched
         if other.kept < self.kept:
             self.worst = other.worst
         self.least, self.kept = min(self.least, other.least), min(self.kept, other.kept)
@@ -412,10 +420,16 @@ def changed(
 
 
 def commanded(station: Station, judge: Judge, seed: int, ticks: int, *, guarded: bool) -> Result:
-    """So many commands of commanders that take turns, while the world changes."""
+    """So many commands of commanders that take turns, while the world changes.
+
+    Of every tenth seed, an arm without the guard gets the same commands, too.
+    """
     rng = np.random.default_rng(seed)
     judge.put({})
-    return _commanded(station, judge, Loop(station, start(station, judge, rng), guarded=guarded), rng, ticks, str(seed))
+    begin = start(station, judge, rng)
+    beside = Loop(station, begin, guarded=False) if guarded and seed % FREE == 0 else None
+    loop = Loop(station, begin, guarded=guarded)
+    return _commanded(station, judge, loop, rng, ticks, str(seed), beside=beside)
 
 
 def simulated(station: Station, judge: Judge, seed: int, ticks: int, *, guarded: bool) -> tuple[Result, Result]:
@@ -429,7 +443,7 @@ def simulated(station: Station, judge: Judge, seed: int, ticks: int, *, guarded:
 
 def _commanded(
     station: Station, judge: Judge, loop: Loop | ControlLoop, rng: np.random.Generator, ticks: int, seed: str,
-    measured: Result | None = None,
+    measured: Result | None = None, beside: Loop | None = None,
 ) -> Result:  # fmt: skip
     result = Result()
     commanders = Commanders(station, judge, rng)
@@ -455,7 +469,11 @@ def _commanded(
             kind = str(rng.choice(Commanders.KINDS))
             stream = commanders.stream(kind, loop.position)
         before, was = loop.position, getattr(loop, "measured", loop.position)
-        now = loop.tick(next(stream))
+        wanted = next(stream)
+        now = loop.tick(wanted)
+        if beside is not None:
+            result.free += 1
+            result.free_touched += judge.along(beside.position, beside.tick(wanted))[0] < 0
         result.overruled += bool(loop.overruled)
         where = f"{station.name}, seed {seed}, tick {tick}, {kind}"
         result.note(judge.along(before, now), where)

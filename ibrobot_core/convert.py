@@ -300,7 +300,7 @@ class Converter:
             except ValueError as error:
                 reasons.append(str(error))
         if len(reasons) == 1:
-            raise ValueError(reasons[0])
+            raise ValueError(reasons[0] + " (null switches it off)" * (value is False))
         expected = [
             " or ".join(map(str, get_args(member)))
             if is_literal(member)

@@ -63,7 +63,7 @@ class Description:
     srdf: Path | None = option(None, help="SRDF with groups, poses and pairs of links that may touch: a path as above")
     tip: str = option("gripperframe", help="site (MJCF) or link (URDF) of the tool centre point")
     floor: float | None = option(
-        None, unit="m", help="height of the table or floor on which the arm stands, in the base frame; none: unknown"
+        None, unit="m", ge=-10, le=10, help="height of the table below the arm, in the base frame; none: unknown"
     )
     poses: Mapping[str, tuple[float, ...]] = option(factory=dict, unit="rad", help="joint positions in joint order")
     arms: Mapping[str, tuple[float, float, float, float]] = option(

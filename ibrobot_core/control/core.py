@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -169,10 +170,11 @@ class ControlCore:
             self._switch_mode(self.mode)
             return True
         if self._pose.late and self._safety.at_rest:
-            joint = self._robot.joint_names[int(away.argmax())]
+            joint, held = self._robot.joint_names[int(away.argmax())], self._pose.held
+            why = f"the guard held it: {json.loads(held)['text']}" if held else "check that nothing is in its way"
             raise HardwareError(
                 f"control.startup: {self._config.control.startup}: not reached within {TIMEOUT_S:g} s: "
-                f"{joint} is {away.max():.2f} rad away; check that nothing is in its way"
+                f"{joint} is {away.max():.2f} rad away; {why}"
             )
         return False
 
@@ -304,11 +306,8 @@ class ControlCore:
     @property
     def stopped(self) -> bool:
         """Whether the stop behaviour has finished."""
-        if self._relaxed:
-            return True
-        if self._pose.target is None or self._pose.late:
-            return self._safety.at_rest
-        return self._pose.reached
+        moves = self._pose.target is not None and not self._pose.late
+        return self._relaxed or (self._pose.reached if moves else self._safety.at_rest)
 
     def abandon(self) -> None:
         """Switch torque off if the stop behaviour is `relax`; for a loop that cannot tick because of a bug."""

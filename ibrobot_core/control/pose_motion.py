@@ -24,6 +24,7 @@ class PoseMotion:
 
     Attributes:
         target: the pose [rad], shape (J,); None without a motion.
+        held: what the guard kept the last motion from at its end, as `Guard.overruled`.
     """
 
     def __init__(self, safety: SafetyLayer, clock: Clock) -> None:
@@ -31,6 +32,7 @@ class PoseMotion:
         self._clock = clock
         self._deadline_ns = 0
         self.target: Vector | None = None
+        self.held = ""
 
     def begin(self, target: Vector) -> None:
         """Begin the motion to `target` [rad], shape (J,)."""
@@ -54,4 +56,7 @@ class PoseMotion:
 
     def desired(self) -> Vector | None:
         """The desired positions of this tick [rad], shape (J,); None to brake, without a motion or if it is late."""
-        return None if self.target is None or self.late else self._safety.towards(self.target, _SPEED)
+        if self.target is None or self.late:
+            return None
+        self.held = self._safety.overruled
+        return self._safety.towards(self.target, _SPEED)

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from ibrobot_core.api import Descriptor, Joint, Robot
 from ibrobot_core.control.commands import BeginStartup, ClearFaults
 from ibrobot_core.control.safety import SafetyLayer
+from ibrobot_core.errors import HardwareError
 from ibrobot_core.interfaces import Executor, Guard
 from ibrobot_core.interfaces.hardware import Condition, Severity
 from ibrobot_core.plugins import Entry
@@ -217,3 +218,14 @@ def test_motions_to_poses_of_the_robot_yaml_are_guarded(make_rig, key: str) -> N
     pan, lift, _ = np.array(rig.hardware.written).T
     assert pan.min() == pytest.approx(-0.3, abs=0.01), "braking included"
     assert lift.max() > 0.9
+
+
+def test_a_start_that_the_guard_holds_back_says_from_what(make_rig) -> None:
+    guard = Says(lambda setpoint: np.maximum(setpoint, [-0.3, -9.0, -9.0]))
+    entry = Entry("guard", Descriptor("says", lambda options, ctx: guard, "says"), "fake", "fake", "1.0")
+    rig = make_rig({"control": {"guard": {"type": "says"}, "startup": "pose rest"}}, entries=[entry])
+    rig.core.start("stream")
+    rig.call(BeginStartup())
+    rig.tick(1100)
+    with pytest.raises(HardwareError, match=r"pan is 0\.50 rad away; the guard held it: x was 10\.0 mm from y$"):
+        rig.core.arrived()

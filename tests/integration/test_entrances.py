@@ -105,6 +105,7 @@ ELSEWHERE: Mapping[tuple[str, str], str] = {
     ("ibrobot replay", "numbers"): (
         "plugins/ibrobot-plugin-data/tests/test_playback.py::test_a_command_that_is_not_finite_is_refused"
     ),
+    ("teleop cmd_vel", "guard"): "tests/integration/test_guarded_base.py::test_no_twist_leads_into_anything",
     **{(f"control.{key}", "guard"): _POSES for key in ("startup", "stop", "load_shedding")},
     ("control.startup", "STOP"): "tests/control/test_core_startup.py::test_a_stop_on_the_way_ends_it",
     ("control.stop", "STOP"): "tests/control/test_core_stops.py::test_nothing_moves_the_robot_any_more",

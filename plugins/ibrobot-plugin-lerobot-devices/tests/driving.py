@@ -36,7 +36,7 @@ from ibrobot_core.config import from_document
 from ibrobot_core.control.build import build_core
 from ibrobot_core.control.commands import ClearFaults, EmergencyStop
 from ibrobot_core.interfaces.run_state import PlanRecord
-from ibrobot_core.plugins import Entry, discover
+from ibrobot_core.plugins import Entry, Registry, discover
 
 AXES = ("x", "y", "theta")
 FEATURES = ("x.vel", "y.vel", "theta.vel")
@@ -280,13 +280,23 @@ class Stand:
 
 
 class Drive:
-    """A run in which a program sends twists."""
+    """A run in which a program sends twists.
 
-    def __init__(self, patches: pytest.MonkeyPatch, share: float = 1.0) -> None:
+    Args:
+        patches: for time and processes.
+        share: of the velocity sent, what the wheels reach.
+        registry: the plugins, by default none.
+        sections: further sections of the robot YAML.
+    """
+
+    def __init__(
+        self, patches: pytest.MonkeyPatch, share: float = 1.0, *, registry: Registry | None = None,
+        sections: Mapping[str, Any] | None = None,
+    ) -> None:  # fmt: skip
         self.world = world = World()
         world.patch(patches)
         world.wheels.share = share
-        registry = discover([])
+        registry = registry or discover([])
 
         def make(options: object, ctx: Any) -> LeRobotHardware:
             self.hardware = LeRobotHardware(
@@ -297,7 +307,8 @@ class Drive:
         registry.entries["hardware", "wheels"] = Entry(
             "hardware", HardwareDescriptor("wheels", make, "wheels"), "fake", "fake", "1.0"
         )
-        config = from_document(yaml.safe_load(DOCUMENT), source=Path("wheels.yaml"), sim=False, registry=registry)
+        document = yaml.safe_load(DOCUMENT) | dict(sections or {})
+        config = from_document(document, source=Path("wheels.yaml"), sim=False, registry=registry)
         self.core = build_core(config, registry, world.clock, 0)
         self.robot = config.robot
         self.ctx = host_context("cmd_vel", robot=config.robot, clock=world.clock)

@@ -242,10 +242,10 @@ def test_a_pair_that_was_nearer_once_is_measured_until_it_has_parted(tmp_path) -
     pairs = Pairs(arm, World(WALL), margin=MARGIN_M, self_margin=MARGIN_M, pressed={})
     near = np.flatnonzero(pairs.distances(clear, np.arange(len(pairs.names))) < MARGIN_M)
     pairs.limits[near] = 0.0005
-    nothing = np.zeros(len(pairs.names))
+    nothing = np.zeros(len(JOINTS))
     assert len(near)
     assert set(near) <= set(pairs.unproved(clear, clear, nothing))
-    pairs.required(clear, near, nothing, np.zeros(len(JOINTS)))
+    pairs.required(clear, near, nothing)
     assert pairs.limits[near].min() > 0.0019
 
 
@@ -498,11 +498,11 @@ class Gate:
         self.worlds: list[World] = []
         make = ClearanceGuard._made
 
-        def made(guard: ClearanceGuard, world: World) -> Any:
+        def made(guard: ClearanceGuard, world: World, before: Pairs | None) -> Any:
             if threading.current_thread() is not threading.main_thread():
                 assert self.opened.wait(60)
                 self.worlds.append(world)
-            return make(guard, world)
+            return make(guard, world, before)
 
         monkeypatch.setattr(ClearanceGuard, "_made", made)
 
@@ -544,10 +544,10 @@ class TestBuildingBesideTheLoop:
         make = loop.guard._building._make
         failing = True
 
-        def made(world: World) -> Any:
+        def made(world: World, before: Pairs) -> Any:
             if failing:
                 raise MemoryError("no room")
-            return make(world)
+            return make(world, before)
 
         monkeypatch.setattr(loop.guard._building, "_make", made)
         loop.world(WALL)

@@ -16,7 +16,7 @@ from ibrobot_planning.guard.changes import WorldChange
 from ibrobot_planning.guard.pairs import Pairs
 from ibrobot_planning.world.arm import Arm
 from ibrobot_planning.world.coal_shapes import geometry
-from ibrobot_planning.world.objects import World
+from ibrobot_planning.world.objects import Voxels, World
 
 _SWITCH_S = 0.0005
 """How long the thread may keep the loop of the same process waiting [s]; 5 ms is Python's default."""
@@ -42,16 +42,19 @@ class Building:
     Args:
         arm: the arm.
         permit: adds to a world what the guard knows besides, and what may be touched.
-        make: makes the pairs of such a world.
+        make: makes the pairs of such a world, with parts of those of the world before.
+        pairs: those of the world without objects.
         log: for objects that are left out.
         in_thread: whether to build in a thread; else in `add`, as stepped time needs it.
     """
 
     def __init__(
-        self, arm: Arm, permit: Callable[[World], World], make: Callable[[World], Pairs], log: logging.Logger, *,
-        in_thread: bool,
+        self, arm: Arm, permit: Callable[[World], World], make: Callable[[World, Pairs], Pairs], pairs: Pairs,
+        log: logging.Logger, *, in_thread: bool,
     ) -> None:  # fmt: skip
         self._arm, self._permit, self._make, self._log = arm, permit, make, log
+        self._pairs = pairs
+        """The last pairs."""
         self._world = World()
         """As it was reported."""
         self._made = permit(self._world)
@@ -101,9 +104,11 @@ class Building:
             world = self._permit(world)
             moved = WorldChange.between(self._made, world).only_moved(self._made)
             if moved is None:
-                self.finished.append(Finished(stale, self._make(world)))
+                self._pairs = self._make(world, self._pairs)
+                self.finished.append(Finished(stale, self._pairs))
             else:
                 places = tuple((name, world.objects[name].pose) for name in moved)
+                self._pairs.note_moved({name: world.objects[name] for name in moved})
                 self.finished.append(Finished(stale, None, places))
         except Exception as error:  # noqa: BLE001 - whatever it is, the loop must know that the world is another one
             self._log.exception("the guard cannot take in the world")
@@ -115,7 +120,8 @@ class Building:
         thing = change.changed[name]
         try:
             World({name: thing}).check(self._arm.frames)
-            geometry(thing.shape)
+            if not isinstance(thing.shape, Voxels):
+                geometry(thing.shape)
         except (PlanningError, ValueError, RuntimeError) as error:
             self.refused += 1
             self._log.warning("the guard leaves an object out: %s: %s", name, error)

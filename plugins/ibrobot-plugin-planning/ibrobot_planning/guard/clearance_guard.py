@@ -14,7 +14,8 @@ from ibrobot_core.api import Context, PlanningError, SteppedClock, Vector, secon
 from ibrobot_core.app import Guard
 from ibrobot_planning.guard.building import Building, Finished
 from ibrobot_planning.guard.changes import WorldChange
-from ibrobot_planning.guard.options import ClearanceGuardOptions
+from ibrobot_planning.guard.joints import ModelJoints, footprint
+from ibrobot_planning.guard.options import BASE, ClearanceGuardOptions
 from ibrobot_planning.guard.pairs import Indices, Pairs
 from ibrobot_planning.guard.permissions import Permissions
 from ibrobot_planning.world.arm import Arm
@@ -27,8 +28,10 @@ _DECAY_S = 1.0
 """Time in which the greatest distance from the path is forgotten by a factor of e [s]."""
 _HALVINGS = 3
 """How finely the share of a motion that leads nearer is chosen."""
-_MOST_LOOKS = 20
-"""Most configurations that are looked at in a tick, which bounds its time."""
+_MOST = 400
+"""How much is looked at in a tick, which bounds its time; see `Pairs.left`."""
+_MOST_BLOCKING = 24
+"""Pairs of which a motion that slides takes account: the nearest ones."""
 _ROUNDS = 3
 """How often a motion that slides is changed because of further pairs."""
 _SWEEPS = 8
@@ -48,35 +51,44 @@ class ClearanceGuard(Guard):
 
     def __init__(self, options: ClearanceGuardOptions, context: Context) -> None:
         self._options = options
-        try:
-            self._arm: Arm = may_touch_arm(context.robot, context.log)
-        except PlanningError as error:
-            raise PlanningError(f"{error}; control.guard: null switches the guard off", error.code) from None
+        robot = context.robot
+        if options.base is not None:
+            model: tuple[Arm, ModelJoints] = footprint(options.base, robot)
+        else:
+            try:
+                model = may_touch_arm(robot, context.log), ModelJoints(np.arange(len(robot.joints)))
+            except PlanningError as error:
+                raise PlanningError(f"{error}; control.guard: null switches the guard off", error.code) from None
+        self._arm, self._joints = model
+        columns = self._joints.columns
         if self._arm.only_visible:
             links = ", ".join(self._arm.only_visible)
             context.log.info("the guard takes hulls of visible meshes for links without collision geometry: %s", links)
         period_s = seconds(context.period_ns)
         self._period_s = period_s
-        self._change: Vector = context.robot.max_acceleration * period_s**2
-        self._follows = ~np.asarray(context.robot.grips)
-        self._permissions = Permissions(options, context.robot, self._arm)
+        self._change: Vector = robot.max_acceleration[columns] * period_s**2
+        self._follows = ~np.asarray(robot.grips)[columns]
+        self._permissions = Permissions(options, robot, self._arm)
         self._begin: Vector = np.zeros(len(self._arm.joint_names))
-        """The last command [rad], shape (J,)."""
-        empty = self._permissions.applied(World())
-        self._pairs = self._made(empty)
+        """The configuration of the model at the last command [rad], shape (M,)."""
+        self._pairs = self._made(self._permissions.applied(World()), None)
         in_thread = not isinstance(context.clock, SteppedClock)
-        self._building = Building(self._arm, self._permissions.applied, self._made, context.log, in_thread=in_thread)
+        self._building = Building(
+            self._arm, self._permissions.applied, self._made, self._pairs, context.log, in_thread=in_thread
+        )
         self._stale = self._label = ""
         self._pair: tuple[str, ...] = ()
         """What the last setpoint was about to touch."""
-        size = len(self._arm.joint_names)
+        size = len(columns)
         self._past: Vector = np.full((max(2, round(_HISTORY_S / period_s)), size), np.nan)
         """The last commands [rad], shape (H, J)."""
         self._newest = -1
         self._away: Vector = np.zeros(size)
         """Largest distance of each joint from the path of its commands, fading [rad], shape (J,)."""
         self._fade = float(np.exp(-period_s / _DECAY_S))
-        self._reach = self._pairs.levers.max(axis=0, initial=0.0)
+        self._reach = np.abs(self._joints.rates(self._pairs.levers.max(axis=0, initial=0.0)[None]))[0]
+        self._strays: Vector = np.zeros(len(self._begin))
+        """Largest distance of each joint of the model from where it is commanded [rad], shape (M,)."""
         self._counts = {"ticks": 0, "slid": 0, "braked": 0, "stale": 0}
 
     @override
@@ -92,12 +104,23 @@ class ClearanceGuard(Guard):
 
     @override
     def accept(self, position: Vector, velocity: Vector, setpoint: Vector, measured: Vector) -> Vector:
+        columns = self._joints.columns
+        accepted: Vector = setpoint.copy()
+        accepted[columns] = self._checked(position[columns], velocity[columns], setpoint[columns], measured[columns])
+        return accepted
+
+    def _checked(self, position: Vector, velocity: Vector, setpoint: Vector, measured: Vector) -> Vector:
+        """As `accept`, of the joints of the model."""
+        self._joints.note(measured)
+        self._begin = self._joints.path(position[None])[0]
         while self._building.finished:
             self._take(self._building.finished.popleft())
-        self._begin = position
         self._note(position, measured)
-        self._pairs.left = _MOST_LOOKS
+        self._pairs.left = _MOST
         step = velocity * self._period_s
+        fastest = np.maximum(np.abs(step), np.abs(setpoint - position))
+        ahead = fastest + fastest**2 / (2 * self._change) + np.nan_to_num(np.abs(position - measured))
+        self._strays = self._joints.strays(self._away, fastest, ahead)
         brakes: Vector = position + np.sign(step) * np.maximum(np.abs(step) - self._change, 0.0)
         return self._accepted(position, brakes, setpoint)
 
@@ -108,67 +131,70 @@ class ClearanceGuard(Guard):
             self._counts["stale"] += 1
             self.overruled = self._said("world", self._stale, None)
             return brakes
-        extra = self._pairs.levers @ self._away
-        blocking = self._blocking(position, setpoint, extra)
+        blocking = self._blocking(position, setpoint)
         if not len(blocking):
             return setpoint
         self._counts["ticks"] += 1
-        nearest = int(blocking[self._pairs.distances(position, blocking).argmin()])
-        self._pair = self._pairs.names[nearest]
+        blocking = blocking[np.argsort(self._pairs.distances(self._begin, blocking), kind="stable")[:_MOST_BLOCKING]]
+        nearest = int(blocking[0])
+        self._pair, blocking = self._pairs.names[nearest], np.sort(blocking)
         if self._pair != before:
             alike = np.flatnonzero([names == self._pair for names in self._pairs.names])
-            away = float(self._pairs.distances(position, alike).min())
+            away = float(self._pairs.distances(self._begin, alike).min())
             self._label = self._said(*self._pair, away, self._strayed(nearest))
         self.overruled = self._label
         lowest, highest = np.minimum(brakes, setpoint), np.maximum(brakes, setpoint)
         for _ in range(_ROUNDS):
             slides = self._along(position, setpoint, lowest, highest, blocking)
-            further = self._blocking(position, slides, extra)
+            further = self._blocking(position, slides)
             if not len(further):
                 self._counts["slid"] += 1
-                return self._most(position, slides, setpoint, extra)
-            if np.isin(further, blocking).all():
+                return self._most(position, slides, setpoint)
+            if np.isin(further, blocking).all() or self._pairs.left <= 0:
                 break
             blocking = np.union1d(blocking, further)
         self._counts["braked"] += 1
-        return self._most(position, brakes, slides, extra)
+        return self._most(position, brakes, slides)
 
-    def _most(self, position: Vector, clear: Vector, wanted: Vector, extra: Vector) -> Vector:
+    def _most(self, position: Vector, clear: Vector, wanted: Vector) -> Vector:
         """The last clear command on the way from one that is clear to one that is wanted, halving the way."""
         best, low, high = clear, 0.0, 1.0
         for _ in range(_HALVINGS):
+            if self._pairs.left <= 0:
+                break
             middle = (low + high) / 2
             command = clear + middle * (wanted - clear)
-            if len(self._blocking(position, command, extra)):
+            if len(self._blocking(position, command)):
                 high = middle
             else:
                 best, low = command, middle
         return best
 
-    def _blocking(self, position: Vector, command: Vector, extra: Vector) -> Indices:
+    def _blocking(self, position: Vector, command: Vector) -> Indices:
         """Pairs that come too near on the way to a command and while braking from it; none if it is clear."""
         pairs, path = self._pairs, self._path(position, command)
-        suspect = pairs.unproved(position, path[-1], extra)
+        least, most = path.min(axis=0), path.max(axis=0)
+        suspect = pairs.unproved(least, most, self._strays)
         if len(suspect):
-            pairs.distances((position + path[-1]) / 2, suspect)
-            suspect = suspect[pairs.unproved(position, path[-1], extra, suspect)]
+            pairs.distances((path[0] + path[-1]) / 2, suspect)
+            suspect = pairs.still_unproved(least, most, self._strays, suspect)
         if not len(suspect):
             return suspect
-        required = pairs.required(position, suspect, extra, self._away)
+        required = pairs.required(path[0], suspect, self._strays)
         return pairs.first_blocked(path, suspect, required)
 
     def _path(self, position: Vector, command: Vector) -> Vector:
-        """The way to a command and to rest, at each tick [rad], shape (N, J)."""
+        """The way to a command and to rest, at each tick, of the joints of the model [rad], shape (N, M)."""
         step = command - position
         ticks = max(1, int(np.ceil(np.abs(step) / self._change).max()))
         steps = np.abs(step) - self._change * np.arange(ticks)[:, None]
         moved = np.cumsum(np.copysign(np.maximum(steps, 0.0), step), axis=0)
-        return np.concatenate([position[None], position + moved])
+        return self._joints.path(np.concatenate([position[None], position + moved]))
 
     def _along(self, position: Vector, setpoint: Vector, lowest: Vector, highest: Vector, blocking: Indices) -> Vector:
         """The command nearest to `setpoint`, within bounds, that leads no blocking pair nearer, if there is one."""
-        self._pairs.distances(position, blocking)
-        gradients = self._pairs.gradients(blocking)
+        self._pairs.distances(self._begin, blocking)
+        gradients = self._joints.rates(self._pairs.gradients(blocking))
         step = setpoint - position
         for _ in range(_SWEEPS):
             before = step
@@ -199,26 +225,30 @@ class ClearanceGuard(Guard):
         """Have a world that is finished."""
         self._stale = finished.stale
         if finished.pairs is not None:
-            finished.pairs.keep_limits(self._pairs)
-            finished.pairs.measured = self._pairs.measured
+            finished.pairs.take_over(self._pairs)
             self._pairs = finished.pairs
         for name, pose in finished.moved:
-            self._pairs.move(name, pinocchio.SE3(matrix(pose)))
+            self._pairs.move(name, pinocchio.SE3(matrix(pose)), self._begin)
 
-    def _made(self, world: World) -> Pairs:
+    def _made(self, world: World, before: Pairs | None) -> Pairs:
         """The pairs of a world with what may be touched; also called in another thread."""
         options, pressed = self._options, self._permissions.pressed
-        made = Pairs(self._arm, world, margin=options.margin, self_margin=options.self_margin, pressed=pressed)
-        made.estimate(self._begin)
+        margins = {} if options.base is None else {BASE: options.base.margin}
+        made = Pairs(
+            self._arm, world, margin=options.margin, self_margin=options.self_margin, pressed=pressed, margins=margins,
+            before=before,
+        )  # fmt: skip
+        made.estimate(self._begin, before)
         return made
 
     def _strayed(self, pair: int) -> str:
         """The joint that is off its commands so far that a pair must stay apart by more than twice its margin."""
-        widened = self._pairs.levers[pair] * self._away
+        widened = self._pairs.levers[pair] * self._strays
         joint = int(widened.argmax())
-        if widened[joint] <= max(self._options.margin, self._options.self_margin):
+        if widened[joint] <= max(self._options.margin, self._options.self_margin, self._pairs.margins[pair]):
             return ""
-        return f", and {self._arm.joint_names[joint]} was {self._away[joint]:.2f} rad from its commands"
+        unit = "m" if self._arm.slides[joint] else "rad"
+        return f", and {self._arm.joint_names[joint]} was {self._strays[joint]:.2f} {unit} from its commands"
 
     def _said(self, first: str, second: str, distance: float | None, why: str = "") -> str:
         """As `overruled`: two things and their distance [m], or `world` and why it is not known well enough."""

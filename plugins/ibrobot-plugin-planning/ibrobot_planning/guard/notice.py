@@ -67,6 +67,9 @@ def notice(config: RobotConfig) -> str:
         if not isinstance(guard.options, ClearanceGuardOptions):
             return f"the guard {guard.type} checks all commands"
         options = guard.options
+        if options.base is not None:
+            around = "the section world" if "world" in config.plugin_sections else "nothing, without a section world"
+            return f"the base keeps {1e3 * options.base.margin:g} mm from {around} (control.guard: null: off)"
         floor = config.robot.description.floor if options.floor is None else options.floor
         things = [] if floor is None else [f"the table at {floor:g} m"]
         things += ["the section world"] if "world" in config.plugin_sections else []

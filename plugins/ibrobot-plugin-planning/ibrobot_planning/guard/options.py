@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Literal
+from itertools import combinations
+from typing import TYPE_CHECKING, Any, Literal
 
 import attrs
 
@@ -12,6 +13,41 @@ from ibrobot_planning.world.options import link_names, near
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
+
+BASE = "base"
+"""The name of a base in messages."""
+_LARGEST_BASE_M = 10.0
+
+
+def _corners(instance: object, attribute: attrs.Attribute[Any], value: tuple[tuple[float, float], ...]) -> None:
+    if len(value) < 3 or not all(abs(number) <= _LARGEST_BASE_M for corner in value for number in corner):
+        raise ValueError(f"must be three corners or more, each x and y within {_LARGEST_BASE_M:g} m, got {list(value)}")
+    (x, y), *others = value
+    if not any(abs((a - x) * (d - y) - (c - x) * (b - y)) > 1e-6 for (a, b), (c, d) in combinations(others, 2)):
+        raise ValueError(f"the corners {list(value)} lie on a line")
+
+
+@documented
+@attrs.frozen
+class BaseOptions:
+    """A base that drives: its footprint stays clear of the objects of the section `world`."""
+
+    footprint: tuple[tuple[float, float], ...] = option(
+        unit="m",
+        validator=_corners,
+        help="corners of its outline about its middle, x ahead and y to the left, with all that sticks out, e.g. an"
+        " arm; their convex hull counts",
+    )
+    bottom: float = option(0.0, unit="m", ge=-10, le=10, help="height at which it begins, in the frame of the world")
+    top: float = option(0.5, unit="m", ge=-10, le=10, help="height at which it ends")
+    margin: float = option(0.05, unit="m", ge=0, le=1, help="least distance from objects")
+    x: str = option("x", help="joint that drives ahead; a base may lack one of the three")
+    y: str = option("y", help="joint that drives to the left")
+    theta: str = option("theta", help="joint that turns, counterclockwise")
+
+    def __attrs_post_init__(self) -> None:
+        if not self.bottom < self.top:
+            raise ValueError(f"bottom ({self.bottom:g}) must be below top ({self.top:g})")
 
 
 @documented
@@ -60,15 +96,32 @@ class ClearanceGuardOptions(Options):
         "hold",
         help="when a part of the world is too old, whose own rule is `refuse`: brake and hold, or keep what was seen",
     )
+    base: BaseOptions | None = option(
+        None, help="of a robot without a model, whose joints are the axes of a base, e.g. for cmd_vel: its footprint"
+    )
     sound: bool = option(False, help="ring the terminal's bell, and sound on the page, when it begins to hold back")
 
     def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-        """Check that the robot has a model, and the links that regions name."""
-        if robot.description.mjcf is None:
-            yield OptionFault((), "the guard needs robot.description.mjcf: set it, or leave control.guard out", "mjcf")
+        """Check that the robot has a model or a base, and the links that regions name."""
+        if self.base is not None:
+            yield from self._check_base(self.base, robot)
+        elif robot.description.mjcf is None:
+            what = "the guard needs robot.description.mjcf, or the footprint of a base: set one, or leave it out"
+            yield OptionFault((), what, "mjcf")
         known = link_names(robot)
         for name, region in self.regions.items():
             for i, link in enumerate(region.links or ()):
                 if known and link not in known:
                     message = f"unknown link {link!r}{did_you_mean(link, known, 'known')}"
                     yield OptionFault(("regions", name, "links", i), message)
+
+    def _check_base(self, base: BaseOptions, robot: Robot) -> Iterable[OptionFault]:
+        if robot.description.mjcf is not None:
+            message = "is for robots without robot.description.mjcf: the model has to have the joints of its base"
+            yield OptionFault(("base",), message)
+        axes = {"x": base.x, "y": base.y, "theta": base.theta}
+        if not set(axes.values()) & set(robot.joint_names):
+            hint = did_you_mean(base.x, robot.joint_names, "the joints are")
+            yield OptionFault(("base",), f"the robot has none of the joints {', '.join(axes.values())}{hint}")
+        if len(set(axes.values())) < len(axes):
+            yield OptionFault(("base",), f"x, y and theta must be three joints, got {', '.join(axes.values())}")

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import coal
 import numpy as np
 import pinocchio
 
 from ibrobot_core.api import Vector
+from ibrobot_planning.guard.parts import Moving, Part, parts
 from ibrobot_planning.world.arm import Arm, Pair, sorted_pair
-from ibrobot_planning.world.collision import Collisions
-from ibrobot_planning.world.objects import World
+from ibrobot_planning.world.objects import World, WorldObject
 
 type Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
 
@@ -23,7 +22,10 @@ _SLACK_M = 0.0001
 """How much nearer than its limit a pair may be where it was measured, e.g. because of rounding [m]."""
 _GIVE_M = 0.00002
 """Distances within this count as equal [m]."""
-_CONVEX = (coal.Halfspace, coal.Box, coal.Sphere, coal.Capsule, coal.Cylinder, coal.ConvexBase)
+_NEAR_M = 0.1
+"""Pairs whose bounding spheres are nearer are measured when they are made [m]."""
+_LOOK, _CONVEX, _CELLS = 8, 1, 8
+"""Time that it takes to place the shapes at a configuration, and to measure a pair of convex shapes, or another one."""
 
 
 class Pairs:
@@ -39,135 +41,180 @@ class Pairs:
         margin: least distance from objects [m].
         self_margin: least distance between links, and between links and what other links carry [m].
         pressed: pairs that may touch -> how deep they may lie in one another [m].
+        margins: links with another `margin` -> their own [m].
+        before: the pairs of the world before, whose parts are used again where they are the same.
     """
 
     def __init__(
-        self, arm: Arm, world: World, *, margin: float, self_margin: float, pressed: Mapping[Pair, float]
-    ) -> None:
-        self._checks = Collisions(arm, world, arm.joint_names, padding=margin, self_padding=self_margin)
-        self._geometry, self._results = self._checks.geometry, self._checks.results
-        self.names: Sequence[Pair] = self._checks.pairs
-        standing = {name for name, thing in world.objects.items() if thing.link is None}
-        limits = [
-            -pressed[pair] if (pair := sorted_pair(a, b)) in pressed else margin if standing & {a, b} else self_margin
+        self, arm: Arm, world: World, *, margin: float, self_margin: float, pressed: Mapping[Pair, float],
+        margins: Mapping[str, float] | None = None, before: Pairs | None = None,
+    ) -> None:  # fmt: skip
+        world.check(arm.frames)
+        carried = World({name: thing for name, thing in world.objects.items() if thing.link is not None})
+        standing = {name: thing for name, thing in world.objects.items() if thing.link is None}
+        known = before if before is not None and before.moving.carried == carried else None
+        self.moving: Moving = Moving.of(arm, carried) if known is None else known.moving
+        of_before = [] if known is None else known.parts
+        robot = of_before[0] if of_before else Part(self.moving, {})
+        self.parts: Sequence[Part] = [robot, *parts(self.moving, standing, of_before[1:])]
+        self._data = arm.model.createData()
+        self.names: Sequence[Pair] = [names for part in self.parts for names in part.names]
+        sizes = [len(part.names) for part in self.parts]
+        begins = np.cumsum([0, *sizes])
+        self._slices = [slice(begin, begin + size) for begin, size in zip(begins[:-1].tolist(), sizes, strict=True)]
+        self._of = np.repeat(np.arange(len(sizes)), sizes)
+        """The part of each pair, shape (P,)."""
+        self._number = np.arange(len(self.names)) - begins[self._of]
+        """The pair's number in its part, shape (P,)."""
+        own = margins or {}
+        self.margins: Vector = np.array([
+            -pressed[pair] if (pair := sorted_pair(a, b)) in pressed
+            else own.get(a, own.get(b, margin)) if a in standing or b in standing
+            else self_margin
             for a, b in self.names
-        ]
-        self.margins: Vector = np.array(limits, dtype=float)
+        ], dtype=float)  # fmt: skip
         """Least distance of each pair [m], shape (P,)."""
         self.limits = self.margins.copy()
         """The same, or less for pairs that were nearer when they were first seen [m], shape (P,)."""
-        shapes = self._geometry.geometryObjects
-        of_shapes = _levers(arm, shapes)
-        self._first = np.array([pair.first for pair in self._geometry.collisionPairs], dtype=np.intp)
-        self._second = np.array([pair.second for pair in self._geometry.collisionPairs], dtype=np.intp)
-        a, b = of_shapes[self._first], of_shapes[self._second]
-        # A joint that moves both does not change their distance.
-        both = (a > 0) & (b > 0)
-        self._moves = np.stack([np.where(both, 0.0, a > 0), np.where(both, 0.0, b > 0)], axis=1)
-        """Whether each joint moves the first and the second shape of each pair, not the other, shape (P, 2, J)."""
-        self.levers: Vector = np.where(both, 0.0, a + b)
+        self.levers: Vector = np.concatenate([part.levers for part in self.parts])
         """Largest motion of each pair per joint [m/rad], shape (P, J)."""
-        self._centres = [shape.geometry.aabb_center if _has_sphere(shape) else np.zeros(3) for shape in shapes]
-        """Of bounding spheres, each in the frame of its shape [m]."""
-        self._spheres = np.array([shape.geometry.aabb_radius if _has_sphere(shape) else np.inf for shape in shapes])
-        """Their radii [m]."""
-        radii = np.array(
-            [radius if shape.parentJoint else 0.0 for radius, shape in zip(self._spheres, shapes, strict=True)]
-        )
-        self._radii = np.stack([radii[self._first], radii[self._second]], axis=1)
-        """Of the shapes of each pair that move, shape (P, 2) [m]."""
-        convex = np.array([isinstance(shape.geometry, _CONVEX) for shape in shapes])
-        self._convex = convex[self._first] & convex[self._second]
-        numbers: dict[str, list[int]] = {name: [] for name in world.objects}
-        for number, pair in enumerate(self.names):
-            for name in pair:
-                if name in numbers:
-                    numbers[name].append(number)
-        self._objects = {name: np.array(each, dtype=np.intp) for name, each in numbers.items()}
-        """Object -> its pairs."""
+        self._moves = np.concatenate([part.moves for part in self.parts])
+        self._radii = np.concatenate([part.radii for part in self.parts])
+        self._convex = np.concatenate([part.convex for part in self.parts])
+        self._costs = np.where(self._convex, _CONVEX, _CELLS)
         self._known = np.full(len(self.names), -math.inf)
         """The last distance of each pair [m], shape (P,)."""
         self._at = np.zeros_like(self.levers)
         """The configuration of each [rad], shape (P, J)."""
-        self._q: Vector = np.zeros(self.levers.shape[1])
-        """The configuration at which the shapes are [rad], shape (J,)."""
+        self._room = np.full(len(self.parts), -math.inf)
+        """How much farther apart than their margin all pairs of each part were at `_seen` [m]."""
+        self._seen = np.zeros((len(self.parts), len(arm.joint_names)))
+        """The configuration of each [rad]."""
+        self._longest = np.array([part.levers.max(axis=0, initial=0.0) for part in self.parts])
+        """Largest motion of the pairs of each part per joint [m/rad]."""
         self.measured = 0
         """Number of distances measured so far."""
         self.left = 0
-        """How many configurations may still be looked at in this tick; without any, what is not proved is blocked."""
+        """How much may still be looked at in this tick; without any, what is not proved is blocked."""
 
-    def keep_limits(self, other: Pairs) -> None:
-        """Take over the limits of pairs that were nearer than their margin in the world before."""
+    def take_over(self, other: Pairs) -> None:
+        """Know what another one knows, and have its limits where pairs were nearer than their margin."""
+        known = {id(part): old for old, part in enumerate(other.parts)}
+        self.measured += other.measured
         near = np.flatnonzero(other.limits < other.margins)
         before: dict[Pair, float] = {}
         for number in near.tolist():
             name = other.names[number]
             before[name] = min(before.get(name, math.inf), float(other.limits[number]))
-        for number, name in enumerate(self.names) if before else ():
-            self.limits[number] = min(self.limits[number], before.get(name, math.inf))
+        for new, (part, at) in enumerate(zip(self.parts, self._slices, strict=True)):
+            if (old := known.get(id(part))) is not None:
+                was = other._slices[old]
+                self._known[at], self._at[at], self.limits[at] = other._known[was], other._at[was], other.limits[was]
+                self._room[new], self._seen[new] = other._room[old], other._seen[old]
+            else:
+                for number, name in enumerate(part.names, at.start) if before else ():
+                    self.limits[number] = min(self.limits[number], before.get(name, math.inf))
 
-    def move(self, name: str, placement: Any) -> None:
-        """Move an object that stands in the base frame to `placement`, a pinocchio.SE3."""
-        pairs, shape = self._objects[name], self._geometry.ngeoms - len(self._objects) + list(self._objects).index(name)
-        self._geometry.geometryObjects[shape].placement = placement
-        self.limits[pairs] = self.margins[pairs]
-        self.estimate(self._q, pairs)
+    def note_moved(self, objects: Mapping[str, WorldObject]) -> None:
+        """Have it that objects are elsewhere, of which the loop is told by `move`: for `before`."""
+        for part in self.parts:
+            part.objects.update((name, thing) for name, thing in objects.items() if name in part.objects)
 
-    def estimate(self, q: Vector, pairs: Indices | None = None) -> None:
-        """Take as distances of pairs, by default of all, those of their bounding spheres at `q`, shape (J,)."""
-        pairs = np.arange(len(self.names)) if pairs is None else pairs
-        self._place(q)
-        first, second, placed = self._first[pairs], self._second[pairs], self._results.oMg
-        centres = np.zeros((len(self._centres), 3))
-        for number in np.union1d(first, second).tolist():
-            centres[number] = placed[number].act(self._centres[number])
-        apart = np.linalg.norm(centres[first] - centres[second], axis=1)
-        self._known[pairs], self._at[pairs] = apart - self._spheres[first] - self._spheres[second], q
+    def move(self, name: str, placement: Any, q: Vector) -> None:
+        """Move an object that stands in the base frame to `placement`, a pinocchio.SE3, while the joints are at `q`."""
+        self._set(q)
+        for number, (part, at) in enumerate(zip(self.parts, self._slices, strict=True)):
+            if name in part.objects:
+                pairs = part.move(name, placement)
+                self._room[number] = -math.inf
+                self._known[pairs + at.start], self._at[pairs + at.start] = part.apart(self._data)[pairs], q
+                self.limits[pairs + at.start] = self.margins[pairs + at.start]
 
-    def unproved(self, begin: Vector, end: Vector, extra: Vector, among: Indices | slice = slice(None)) -> Indices:
-        """Which pairs of `among` may come nearer than their margins between two configurations, each of shape (J,).
+    def estimate(self, q: Vector, other: Pairs | None = None) -> None:
+        """Take as distances those of bounding spheres at `q`, shape (J,), and measure those that are near.
+
+        Of parts that another one has, nothing is changed: `take_over` has what is known of them.
+        """
+        shared = set() if other is None else {id(part) for part in other.parts}
+        self._set(q)
+        near = []
+        for part, at in zip(self.parts, self._slices, strict=True):
+            if id(part) not in shared:
+                self._known[at], self._at[at] = part.apart(self._data), q
+                near.append(at.start + np.flatnonzero(self._known[at] < _NEAR_M))
+        if near:
+            self.distances(q, np.concatenate(near))
+
+    def unproved(self, least: Vector, most: Vector, strays: Vector) -> Indices:
+        """Which pairs may come nearer than their margins while joints are within bounds, each of shape (J,).
 
         Not their limits: a pair that was nearer once must be measured while it parts, so that its limit rises.
 
         Args:
-            begin: the first.
-            end: the last; on the way between them no joint turns back.
-            extra: distance beyond the margin that each pair should keep [m], shape (P,).
-            among: the pairs.
+            least: lowest positions of the joints.
+            most: highest ones.
+            strays: how far each joint may be from there.
         """
+        far = np.maximum(np.abs(least - self._seen), np.abs(most - self._seen)) + strays
+        wide = (far * self._longest).sum(axis=1) >= self._room
+        if not wide.any():
+            return np.zeros(0, dtype=np.intp)
+        among = np.flatnonzero(wide[self._of])
+        of, middle = self._of[among], (least + most) / 2
+        known, at, levers = self._known[among], self._at[among], self.levers[among]
+        room = known - self.margins[among]
+        begins = np.flatnonzero(np.diff(of, prepend=-1))
+        near = room - np.einsum("pj,pj->p", np.abs(middle - at), levers)
+        self._room[of[begins]], self._seen[of[begins]] = np.minimum.reduceat(near, begins), middle
+        far = np.maximum(np.abs(least - at), np.abs(most - at)) + strays
+        found: Indices = among[room < np.einsum("pj,pj->p", far, levers)]
+        return found
+
+    def still_unproved(self, least: Vector, most: Vector, strays: Vector, among: Indices) -> Indices:
+        """Those of some pairs, which have been measured since."""
         at = self._at[among]
-        far = np.maximum(np.abs(begin - at), np.abs(end - at))
+        far = np.maximum(np.abs(least - at), np.abs(most - at)) + strays
         bound: Vector = np.einsum("pj,pj->p", far, self.levers[among])
-        return np.flatnonzero(self._known[among] - bound < self.margins[among] + extra[among])
+        return among[self._known[among] - bound < self.margins[among]]
 
     def distances(self, q: Vector, pairs: Indices) -> Vector:
         """Measure the distances of pairs at a configuration, shape (J,) [m]."""
-        self._place(q)
-        compute, geometry, results = pinocchio.computeDistance, self._geometry, self._results
-        values = np.array([compute(geometry, results, pair).min_distance for pair in pairs.tolist()])
+        self._set(q)
+        compute = pinocchio.computeDistance
+        values = np.array([
+            compute(part.geometry, part.results, number).min_distance for part, number in self._placed(pairs)
+        ], dtype=float)  # fmt: skip
         self.measured += len(pairs)
-        self.left -= 1
+        self.left -= _LOOK + int(self._costs[pairs].sum())
         self._known[pairs], self._at[pairs] = values, q
         return values
 
-    def _place(self, q: Vector) -> None:
-        """Have all shapes where they are at a configuration, shape (J,)."""
-        checks, self._q = self._checks, q
-        native = checks.native(q[None])[0]
-        pinocchio.updateGeometryPlacements(checks.arm.model, checks.data, self._geometry, self._results, native)
+    def _set(self, q: Vector) -> None:
+        """Have the joints at a configuration, shape (J,)."""
+        arm = self.moving.arm
+        pinocchio.forwardKinematics(arm.model, self._data, arm.native(q))
 
-    def required(self, q: Vector, pairs: Indices, extra: Vector, strays: Vector) -> Vector:
+    def _placed(self, pairs: Indices) -> Iterator[tuple[Part, int]]:
+        """The part of each pair, with its shapes placed, and the pair's number in it."""
+        last = -1
+        for of, number in zip(self._of[pairs].tolist(), self._number[pairs].tolist(), strict=True):
+            if of != last:
+                self.parts[of].place(self._data)
+                last = of
+            yield self.parts[of], number
+
+    def required(self, q: Vector, pairs: Indices, strays: Vector) -> Vector:
         """How far pairs must stay apart from now on, if the arm is at `q` [m].
 
-        A pair that is nearer than its limit may get farther, and then not come back; so may one that is within `extra`.
+        A pair that is nearer than its limit may get farther, and then not come back; so may one that joints that stray
+        could lead nearer than it.
 
         Args:
             q: joint positions [rad], shape (J,).
             pairs: the pairs, K in number.
-            extra: distance beyond the limit that each pair should keep [m], shape (P,).
-            strays: how far each joint may be from `q`, of which `extra` is made [rad], shape (J,).
+            strays: how far each joint may be from `q` [rad], shape (J,).
         """
-        now, limits, extra = self.distances(q, pairs), self.limits[pairs], extra[pairs]
+        now, limits, extra = self.distances(q, pairs), self.limits[pairs], self.levers[pairs] @ strays
         if extra.max(initial=0.0) > _SLACK_M:
             extra = np.minimum(extra, self._approach(strays, pairs, evenly=False))
         # A pair that something else than a command has brought together, e.g. a new object, may part.
@@ -181,11 +228,13 @@ class Pairs:
         """The pairs that come nearer than required at one configuration of a path; none if all of it is clear.
 
         Args:
-            path: configurations at the ticks, shape (N, J); no joint turns back, and between ticks all move evenly.
+            path: configurations at the ticks, shape (N, J); between ticks all joints move evenly.
             pairs: the pairs to check.
             required: their least distances [m].
         """
         last = len(path) - 1
+        steps = np.diff(path, axis=0)
+        turns_back = bool(((steps > 0).any(axis=0) & (steps < 0).any(axis=0)).any())
         for at in (last, 1):  # where the motion ends, since most that is blocked is blocked there; and the next command
             near = self.distances(path[at], pairs) < required
             if near.any():
@@ -201,6 +250,9 @@ class Pairs:
                 middle = float(round(middle))
             at_middle, at_end = _between(path, middle), _between(path, end)
             half = np.maximum(np.abs(_between(path, begin) - at_middle), np.abs(at_end - at_middle))
+            if not within and turns_back:
+                inside = path[math.ceil(begin) : math.floor(end) + 1]
+                half = np.maximum(half, np.abs(inside - at_middle).max(axis=0, initial=0.0))
             bound = self.levers[among] @ half
             apart = self.distances(at_middle, among) - needed
             if (apart < 0).any():
@@ -224,7 +276,7 @@ class Pairs:
             pairs: the pairs, K in number.
             evenly: whether they move together, or else each by itself.
         """
-        normals, rates, turns = self._rates(pairs, self._centres)
+        normals, rates, turns = self._rates(pairs, nearest=False)
         if evenly:
             along, turning = rates @ half, (turns @ half)[..., None]
         else:
@@ -239,31 +291,38 @@ class Pairs:
 
     def gradients(self, pairs: Indices) -> Vector:
         """How the distances of pairs change with the joints where they were measured last [m/rad], shape (K, J)."""
-        return self._rates(pairs, None)[1]
+        return self._rates(pairs, nearest=True)[1]
 
-    def _rates(self, pairs: Indices, centres: Sequence[Vector] | None) -> tuple[Vector, Vector, Vector]:
-        """Motion of pairs with the joints where they were measured last: of points of bodies, by default the nearest.
+    def _rates(self, pairs: Indices, *, nearest: bool) -> tuple[Vector, Vector, Vector]:
+        """Motion of pairs with the joints where they were measured last: of points of bodies.
+
+        Args:
+            pairs: the pairs, K in number.
+            nearest: whether of the nearest points, or else of the centres of bounding spheres.
 
         Returns:
             The direction from the first body to the second, shape (K, 3); how fast they part [m/rad], shape (K, J); and
             how they turn, shape (K, 2, 3, J).
         """
-        checks, results = self._checks, self._results
-        pinocchio.computeJointJacobians(checks.arm.model, checks.data)
-        jacobian = checks.data.J[:, checks.arm.columns]
-        nearest = [results.distanceResults[pair] for pair in pairs.tolist()]
-        normals = np.array([each.normal for each in nearest])
-        if centres is None:
-            ends = [(each.getNearestPoint1(), each.getNearestPoint2()) for each in nearest]
-        else:
-            numbers = zip(self._first[pairs].tolist(), self._second[pairs].tolist(), strict=True)
-            ends = [(results.oMg[a].act(centres[a]), results.oMg[b].act(centres[b])) for a, b in numbers]
-        points = np.array(ends)  # (K, 2, 3)
+        arm = self.moving.arm
+        pinocchio.computeJointJacobians(arm.model, self._data)
+        jacobian = self._data.J[:, arm.columns]
+        normals, points = np.empty((len(pairs), 3)), np.empty((len(pairs), 2, 3))
+        for row, (part, number) in enumerate(
+            zip((self.parts[of] for of in self._of[pairs].tolist()), self._number[pairs].tolist(), strict=True)
+        ):
+            result = part.results.distanceResults[number]
+            normals[row] = result.normal
+            if nearest:
+                points[row] = result.getNearestPoint1(), result.getNearestPoint2()
+            else:
+                a, b = part.ends[number].tolist()
+                points[row] = part.results.oMg[a].act(part.centres[a]), part.results.oMg[b].act(part.centres[b])
         turns = jacobian[3:] * self._moves[pairs][:, :, None, :]
         # n . (v + w x p) = n . v + (p x n) . w
         arms = np.stack([_cross(points[:, 0], normals), _cross(points[:, 1], normals)], axis=1)
-        parts = (normals @ jacobian[:3])[:, None] * self._moves[pairs] + np.einsum("ksc,kscj->ksj", arms, turns)
-        rates = parts[:, 1] - parts[:, 0]
+        moving = (normals @ jacobian[:3])[:, None] * self._moves[pairs] + np.einsum("ksc,kscj->ksj", arms, turns)
+        rates = moving[:, 1] - moving[:, 0]
         return normals, rates, turns
 
 
@@ -278,33 +337,3 @@ def _between(path: Vector, at: float) -> Vector:
     share = at - before
     configuration: Vector = path[before] * (1.0 - share) + path[before + 1] * share
     return configuration
-
-
-def _has_sphere(shape: Any) -> bool:
-    """Whether a bounding sphere of a shape is known; it computes it."""
-    shape.geometry.computeLocalAABB()
-    return math.isfinite(shape.geometry.aabb_radius)
-
-
-def _levers(arm: Arm, shapes: Sequence[Any]) -> Vector:
-    """Largest distance of any point of each shape from each joint's axis [m]; 1 for slides, 0 if it moves it not.
-
-    Shape (S, J). Upper bounds for all configurations, from bounding spheres on a stretched-out arm.
-    """
-    model = arm.model
-    columns = {int(number): column for column, number in enumerate(arm.numbers)}
-    travel = np.where(arm.slides, np.maximum(np.abs(arm.lower), np.abs(arm.upper)), 0.0)
-    levers = np.zeros((len(shapes), len(arm.joint_names)))
-    for row, shape in zip(levers, shapes, strict=True):
-        joint = int(shape.parentJoint)
-        if joint == 0:
-            continue
-        shape.geometry.computeLocalAABB()
-        centre = shape.placement.act(shape.geometry.aabb_center)
-        away = float(np.linalg.norm(centre) + shape.geometry.aabb_radius)
-        while joint:
-            column = columns[joint]
-            row[column] = 1.0 if arm.slides[column] else away
-            away += travel[column] + float(np.linalg.norm(model.jointPlacements[joint].translation))
-            joint = int(model.parents[joint])
-    return levers

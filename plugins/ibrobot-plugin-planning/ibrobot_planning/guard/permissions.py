@@ -47,6 +47,8 @@ class Permissions:
     def __init__(self, options: ClearanceGuardOptions, robot: Robot, arm: Arm) -> None:
         self._options, self._hands = options, hands(robot, arm)
         floor = robot.description.floor if options.floor is None else options.floor
+        if options.base is not None:  # it stands on its floor
+            floor = None
         self._fixed = {} if floor is None else {FLOOR: WorldObject(Plane(), Pose(Vector3(0.0, 0.0, floor)))}
         may_touch = {FLOOR: self._hands} if options.may_touch is None else options.may_touch
         self.pressed: Mapping[Pair, float] = {

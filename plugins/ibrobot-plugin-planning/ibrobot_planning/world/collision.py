@@ -80,15 +80,17 @@ class Collisions:
         indices = np.array([arm.joint_names.index(name) for name in joints], dtype=np.intp)
         self._still = arm.native(np.array([(others or {}).get(name, 0.0) for name in arm.joint_names]))
         self._columns, self._reference = arm.columns[indices], arm.reference[indices]
-        objects = _objects(arm, world)
+        objects = object_shapes(arm, world)
         self.reach = reach(arm, objects)[indices]
         """Maximum motion of any point per joint [m/rad], shape (J,)."""
         self.data = arm.model.createData()
         """pinocchio.Data."""
 
-        def engine(links: Sequence[LinkShape]) -> _Engine:
+        def engine(links: Sequence[LinkShape]) -> Engine:
             shapes = [*links, *objects]
-            return _Engine(arm.model, self.data, shapes, *_pairs(world, shapes, padding, self_padding, arm.unchecked))
+            return Engine(
+                arm.model, self.data, shapes, *checked_pairs(world, shapes, padding, self_padding, arm.unchecked)
+            )
 
         self._exact = engine(arm.shapes)
         self._coarse = engine(arm.hulls) if arm.hulls else self._exact
@@ -242,7 +244,7 @@ class Clearance:
         )
 
 
-class _Engine:
+class Engine:
     """Native checks of shapes, with margins that can be widened.
 
     Args:
@@ -340,7 +342,7 @@ def unchecked_pairs(arm: Arm, *, samples: int = _SAMPLES, seed: int = 0, never: 
     return reasons
 
 
-def _objects(arm: Arm, world: World) -> list[LinkShape]:
+def object_shapes(arm: Arm, world: World) -> list[LinkShape]:
     """Objects as shapes, each with the link that carries it, if any."""
     shapes = []
     for name, thing in world.objects.items():
@@ -349,7 +351,7 @@ def _objects(arm: Arm, world: World) -> list[LinkShape]:
     return shapes
 
 
-def _pairs(
+def checked_pairs(
     world: World, shapes: Sequence[LinkShape], padding: float, self_padding: float, unchecked: Collection[Pair]
 ) -> tuple[Flags, Vector]:
     """Which pairs of shapes to check, and their margins [m], both shape (S, S)."""

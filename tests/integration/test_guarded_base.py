@@ -1,0 +1,199 @@
+"""A base that twists drive among objects: with its footprint in the YAML it touches none, as MuJoCo sees it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+from ibrobot_planning.guard.changes import WorldChange
+from ibrobot_planning.guard.joints import BaseWays
+from ibrobot_planning.world.objects import Box, WorldObject
+from plugin_tests import of_tests
+
+from ibrobot_core.api import Pose, Vector, Vector3
+from ibrobot_core.app import ConfigError, installed_plugins, load_config
+from ibrobot_core.control.commands import ChangeWorld
+
+pytestmark = pytest.mark.integration
+
+driving = of_tests("ibrobot-plugin-lerobot-devices", "driving")
+FOOTPRINT = [[0.15, 0.1], [0.15, -0.1], [-0.1, -0.1], [-0.1, 0.1]]
+MARGIN_M = 0.05
+CLEARANCE = {"type": "clearance", "base": {"footprint": FOOTPRINT, "top": 0.3, "margin": MARGIN_M}}
+SIZE = (0.2, 0.3, 0.4)
+_OFF_M = 0.002
+"""How far the sum of measured velocities may be from where the base is."""
+
+
+class Judge:
+    """Where the base is, by the velocities of its wheels, and MuJoCo's distance of its footprint from boxes."""
+
+    def __init__(self, drive: Any, boxes: Mapping[str, WorldObject]) -> None:
+        self._world, self.pose = drive.world, np.zeros(3)
+        spec = mujoco.MjSpec()
+        body = spec.worldbody.add_body(name="base", mocap=True)
+        body.add_geom(name="base", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.125, 0.1, 0.15], pos=[0.025, 0, 0.15])
+        for name, thing in boxes.items():
+            p = thing.pose.position
+            half = [length / 2 for length in SIZE]
+            spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=[p.x, p.y, p.z])
+        self._model, self._boxes = spec.compile(), list(boxes)
+        self._data = mujoco.MjData(self._model)
+        self.nearest, self.driven = 1.0, 0.0
+        step = self._world.step
+
+        def watch() -> None:
+            begun_ns = self._world.clock.now_ns()
+            velocity = self._world.wheels.velocity
+            step()
+            self._drive(velocity, (self._world.clock.now_ns() - begun_ns) / 1e9)
+
+        drive.world.step = watch
+
+    def _drive(self, velocity: Vector, seconds: float) -> None:
+        x, y, turn = velocity * seconds
+        if not (x or y or turn):
+            return
+        heading = self.pose[2] + turn / 2
+        cos, sin = np.cos(heading), np.sin(heading)
+        self.pose = self.pose + np.array([cos * x - sin * y, sin * x + cos * y, turn])
+        self.driven += float(np.hypot(x, y))
+        self.nearest = min(self.nearest, self.distance())
+
+    def distance(self) -> float:
+        """From the nearest box, at most 1 [m]."""
+        self._data.mocap_pos[0] = (*self.pose[:2], 0.0)
+        self._data.mocap_quat[0] = (np.cos(self.pose[2] / 2), 0, 0, np.sin(self.pose[2] / 2))
+        mujoco.mj_kinematics(self._model, self._data)
+        base = self._model.geom("base").id
+        return min(
+            mujoco.mj_geomDistance(self._model, self._data, base, self._model.geom(name).id, 1.0, None)
+            for name in self._boxes
+        )
+
+
+def start(patches: pytest.MonkeyPatch, boxes: Mapping[str, WorldObject], *, guarded: bool = True) -> tuple[Any, Judge]:
+    sections = {"control": {"guard": CLEARANCE}} if guarded else {}
+    drive = driving.Drive(patches, registry=installed_plugins(), sections=sections)
+    if guarded:
+        drive.core.handle(ChangeWorld(WorldChange(boxes).message()))
+    return drive, Judge(drive, boxes)
+
+
+def box(x: float, y: float) -> WorldObject:
+    return WorldObject(Box(SIZE), Pose(Vector3(x, y, 0.2)))
+
+
+AHEAD = {"crate": box(0.7, 0.0)}
+
+
+def test_a_base_stops_in_front_of_what_the_world_lists_and_says_so(monkeypatch) -> None:
+    drive, judge = start(monkeypatch, AHEAD)
+    drive.drive(np.array([0.3, 0.0, 0.0]), 4.0)
+    assert MARGIN_M - _OFF_M < judge.nearest < MARGIN_M + 0.02
+    said = [
+        json.loads(each["overruled"]) for each in drive.core.events if each["event"] == "guard" and each["overruled"]
+    ]
+    assert {said[0]["first"], said[0]["second"]} == {"base", "crate"}
+    drive.drive(np.array([-0.3, 0.0, 0.0]), 1.0)
+    assert judge.distance() > 0.2, "the way back is free"
+    drive.close()
+
+
+def test_it_slides_along_a_wall(monkeypatch) -> None:
+    drive, judge = start(monkeypatch, AHEAD)
+    drive.drive(np.array([0.3, 0.05, 0.0]), 3.0)
+    assert judge.pose[1] > 0.05
+    assert judge.nearest > MARGIN_M - _OFF_M
+    drive.close()
+
+
+def test_without_the_guard_it_drives_into_it(monkeypatch) -> None:
+    drive, judge = start(monkeypatch, AHEAD, guarded=False)
+    drive.drive(np.array([0.3, 0.0, 0.0]), 4.0)
+    assert judge.nearest < -0.05
+    drive.close()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_twist_leads_into_anything(monkeypatch, seed: int) -> None:
+    """Twists of all three axes among boxes; wheels that reach 60 to 100 % of what they are sent."""
+    rng = np.random.default_rng(seed)
+    boxes = {}
+    for number in range(5):
+        angle, away = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 1.0)
+        boxes[f"box{number}"] = box(away * np.cos(angle), away * np.sin(angle))
+    drive, judge = start(monkeypatch, boxes)
+    begun = judge.distance()
+    for _ in range(14):
+        drive.world.wheels.share = rng.uniform(0.6, 1.0)
+        drive.drive(driving.FASTEST * rng.uniform(-1, 1, 3), rng.uniform(0.3, 1.2))
+        assert not drive.core.fault
+    assert judge.driven > 0.5
+    assert judge.nearest > min(MARGIN_M, begun) - _OFF_M
+    drive.close()
+
+
+def test_an_object_that_appears_is_braked_for_at_once(monkeypatch) -> None:
+    drive, judge = start(monkeypatch, {"far": box(5.0, 5.0)})
+    drive.drive(np.array([0.3, 0.0, 0.0]), 0.6)
+    x = judge.pose[0]
+    drive.core.handle(ChangeWorld(WorldChange({"crate": box(x + 0.15 + 0.1 + 0.03, 0.0)}).message()))
+    drive.tick(1.0)
+    braking = 0.3**2 / (2 * 2.0)
+    assert judge.pose[0] - x < braking + 0.02, "braking, and what it drives until a velocity reaches its wheels"
+    drive.close()
+
+
+def test_the_pose_is_the_sum_of_ways() -> None:
+    """As small steps add it up, whatever the axes are."""
+    rng = np.random.default_rng(0)
+    for axes in ([0, 1, 2], [0, 2], [1, 2], [0], [2]):
+        ways, reference = BaseWays(np.arange(len(axes)), axes), np.zeros(3)
+        at = np.zeros(len(axes))
+        ways.note(at)
+        for _ in range(100):
+            step = rng.uniform(-0.05, 0.05, len(axes))
+            ahead = ways.path(np.stack([at, at + step]))[-1]
+            whole = np.zeros(3)
+            whole[axes] = step / 1000
+            for _ in range(1000):
+                cos, sin = np.cos(reference[2] + whole[2] / 2), np.sin(reference[2] + whole[2] / 2)
+                reference += [cos * whole[0] - sin * whole[1], sin * whole[0] + cos * whole[1], whole[2]]
+            at = at + step
+            ways.note(at)
+            assert ways.pose == pytest.approx(reference, abs=1e-7)
+            assert ahead == pytest.approx(reference, abs=1e-7)
+        ways.note(np.full(len(axes), np.nan))
+        assert ways.pose == pytest.approx(reference, abs=1e-6), "a lost reading moves nothing"
+
+
+BASES: list[tuple[Mapping[str, Any], str]] = [
+    ({"footprint": [[0, 0], [1, 0]]}, r"base\.footprint: must be three corners or more"),
+    ({"footprint": [[0, 0], [1, 0], [2, 0]]}, r"base\.footprint: the corners .* lie on a line"),
+    ({"footprint": [[0, 0], [1, 0], [0, 250]]}, r"base\.footprint: must be .* within 10 m"),
+    ({"footprint": [[0, 0], [1, 0], [0, float("nan")]]}, r"base\.footprint: must be"),
+    ({"footprint": FOOTPRINT, "top": 0.0}, r"base: bottom \(0\) must be below top \(0\)"),
+    (
+        {"footprint": FOOTPRINT, "x": "vorward", "y": "links", "theta": "turn"},
+        r"base: the robot has none of the joints",
+    ),
+    ({"footprint": FOOTPRINT, "y": "x"}, r"base: x, y and theta must be three joints"),
+    ({}, r"base\.footprint: required key is missing"),
+]
+
+
+@pytest.mark.parametrize(("base", "fault"), BASES)
+def test_a_base_that_is_none_is_refused(tmp_path: Path, base: Mapping[str, Any], fault: str) -> None:
+    document = yaml.safe_load(driving.DOCUMENT) | {"control": {"guard": {"type": "clearance", "base": dict(base)}}}
+    document["hardware"] = {"type": "lerobot", "robot": "lekiwi", "units": {}}
+    path = tmp_path / "wheels.yaml"
+    path.write_text(yaml.safe_dump(document), encoding="utf-8")
+    with pytest.raises(ConfigError, match=rf"wheels\.yaml:\d+: control\.guard\.{fault}"):
+        load_config(path, sim=False)
