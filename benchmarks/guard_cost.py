@@ -30,7 +30,6 @@ from figures import report
 from guard_trials import CONFIGS, Judge, Loop, Station
 from ibrobot_planning.guard.changes import WorldChange
 from ibrobot_planning.world.objects import Box, Voxels, WorldObject
-from ibrobot_planning.world.section import WorldKeeper
 
 from ibrobot_core.api import Pose, Vector3
 from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
@@ -43,11 +42,11 @@ PARTS = ("checks", "lateness", "floods")
 
 def places(count: int, rng: np.random.Generator) -> dict[str, tuple[float, float, float]]:
     """Places of boxes around an arm, the nearest within its reach [m]."""
-    found = {}
+    of_boxes = {}
     for number in range(count):
         angle, away = rng.uniform(-np.pi, np.pi), rng.uniform(0.28, 0.45 if count < 50 else 1.5)
-        found[f"box{number}"] = (away * np.cos(angle), away * np.sin(angle), rng.uniform(0.03, 0.4))
-    return found
+        of_boxes[f"box{number}"] = (away * np.cos(angle), away * np.sin(angle), rng.uniform(0.03, 0.4))
+    return of_boxes
 
 
 def boxes(count: int, rng: np.random.Generator) -> dict[str, WorldObject]:
@@ -142,23 +141,23 @@ def run(seconds: float, *, guarded: bool, flood: Callable[[Runtime, float], None
 
 def lateness(pairs: int, seconds: float) -> dict[str, float]:
     """Pairs of runs with and without the guard; in every other pair, the one without comes first."""
-    found = []
+    of_pairs = []
     for number in range(pairs):
         load = os.getloadavg()[0]
         both = {guarded: run(seconds, guarded=guarded) for guarded in ((True, False) if number % 2 else (False, True))}
-        found.append(both)
+        of_pairs.append(both)
         print(
             f"pair {number + 1}, load {load:.2f}: lateness p50 {both[True]['p50']} us with the guard,"
             f" {both[False]['p50']} without, p99 {both[True]['p99']} and {both[False]['p99']} us;"
             f" missed {both[True]['missed']} and {both[False]['missed']}",
             flush=True,
         )
-    ratios = [both[True]["p99"] / max(1, both[False]["p99"]) for both in found]
+    ratios = [both[True]["p99"] / max(1, both[False]["p99"]) for both in of_pairs]
     print(f"p99 with the guard is {statistics.median(ratios):.2f} times that without, in the median of {pairs} pairs")
     return {
         "lateness_p99_ratio": statistics.median(ratios),
-        "missed_guarded": sum(both[True]["missed"] for both in found),
-        "missed_free": sum(both[False]["missed"] for both in found),
+        "missed_guarded": sum(both[True]["missed"] for both in of_pairs),
+        "missed_free": sum(both[False]["missed"] for both in of_pairs),
     }
 
 
@@ -185,9 +184,9 @@ def moves(runtime: Runtime, seconds: float) -> None:
 def clouds(runtime: Runtime, seconds: float) -> None:
     """Clouds of 20,000 cells around the arm, another one each time."""
     rng = np.random.default_rng(4)
-    keeper = next(each for each in runtime.plan.components if isinstance(each, WorldKeeper))
-    for _ in range(int(5 * (seconds - 1.0))):
-        keeper.put("cloud", cloud(rng))
+    changes = [WorldChange({"cloud": cloud(rng)}).message() for _ in range(4)]
+    for number in range(int(5 * (seconds - 2.0))):
+        runtime.session.change_world(changes[number % len(changes)])
         time.sleep(0.2)
 
 

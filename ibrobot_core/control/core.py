@@ -157,10 +157,8 @@ class ControlCore:
             if not (self._safety.at_rest or self._relaxed):
                 return False  # still braking
             raise HardwareError(f"control.startup: {self._config.control.startup}: {self.fault}")
-        if self.phase is not Phase.ARRIVING:
-            return True
-        if self._pose.target is None:
-            return False  # it waits for `begin_startup`
+        if self.phase is not Phase.ARRIVING or self._pose.target is None:  # it waits for `begin_startup`
+            return self.phase is not Phase.ARRIVING
         measured = self._readings.newest
         away = np.abs(measured.position - self._pose.target)
         # The mode starts from the measured positions; those of an old reading would pull the robot back.
@@ -202,6 +200,7 @@ class ControlCore:
         command = self._safety.apply(desired, measured.position)
         if self._safety.overruled and desired is not None:
             self._executors.note_guard(self._safety.overruled, command != desired)
+            self._pose.held = self._safety.overruled
         if (overruled := self._safety.overruled) != self._overruled:
             self._overruled = overruled
             self.events.append({"event": "guard", "overruled": overruled})

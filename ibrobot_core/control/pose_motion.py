@@ -24,13 +24,11 @@ class PoseMotion:
 
     Attributes:
         target: the pose [rad], shape (J,); None without a motion.
-        held: what the guard kept the last motion from at its end, as `Guard.overruled`.
+        held: what the guard kept it from last, as `Guard.overruled`.
     """
 
     def __init__(self, safety: SafetyLayer, clock: Clock) -> None:
-        self._safety = safety
-        self._clock = clock
-        self._deadline_ns = 0
+        self._safety, self._clock, self._deadline_ns = safety, clock, 0
         self.target: Vector | None = None
         self.held = ""
 
@@ -51,12 +49,9 @@ class PoseMotion:
     @property
     def reached(self) -> bool:
         """Whether the joints are commanded to rest at the target."""
-        safety, target = self._safety, self.target
-        return target is not None and safety.at_rest and np.allclose(safety.current, target, atol=1e-4)
+        at_rest, target = self._safety.at_rest, self.target
+        return at_rest and target is not None and np.allclose(self._safety.current, target, atol=1e-4)
 
     def desired(self) -> Vector | None:
         """The desired positions of this tick [rad], shape (J,); None to brake, without a motion or if it is late."""
-        if self.target is None or self.late:
-            return None
-        self.held = self._safety.overruled
-        return self._safety.towards(self.target, _SPEED)
+        return None if self.target is None or self.late else self._safety.towards(self.target, _SPEED)

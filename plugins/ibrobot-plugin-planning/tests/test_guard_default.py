@@ -21,7 +21,7 @@ from .conftest import Make
 from .test_motion import robot_yaml
 
 MODEL = {"robot": {"description": {"mjcf": "arm.xml"}}}
-FLOOR = "robot.description.floor=0.1"
+FLOOR = "robot.description.floor=0.04"
 
 
 def with_floor(floor: Any) -> dict[str, Any]:
@@ -82,7 +82,7 @@ class TestRun:
     def test_a_table_is_enough(self, make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         config, line = said(make, caplog, FLOOR, text=robot_yaml(tmp_path))
         assert config.control.guard is not None
-        assert line == "all commands keep 3 mm from the table at 0.1 m, 1 mm between links (control.guard: null: off)"
+        assert line == "all commands keep 3 mm from the table at 0.04 m, 1 mm between links (control.guard: null: off)"
         assert config.document["control"]["guard"] == {"type": "clearance"}, "recordings have it"
 
     def test_one_key_switches_it_off(self, make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -162,3 +162,28 @@ def test_a_run_says_at_its_end_whether_the_guard_acted(
             run.session.bus.publish("/guard", String(text), latched=True)
         run.stop()
     assert ("the guard held the arm back" in caplog.text) is acted
+
+
+HIGH = r"a table at 0\.3 m is above the arm's first joint, which is at 0\.05 m"
+
+
+@pytest.mark.parametrize(
+    ("override", "fault"),
+    [
+        ("robot.description.floor=0.3", rf"robot\.description\.floor: {HIGH}"),
+        ("robot.description.floor=16", r"robot\.description\.floor: -?16\.0 is too .*10 m"),
+        ("robot.description.floor=-16", r"robot\.description\.floor: -?16\.0 is too .*10 m"),
+        ("control.guard={type: clearance, floor: 0.3}", rf"control\.guard\.floor: {HIGH}"),
+        ("control.guard={type: clearance, floor: 16}", r"control\.guard\.floor: a table at 16 m is above"),
+        ("goals.floor=0.3", rf"goals\.floor: {HIGH}"),
+        ("control.guard=false", r"control\.guard: expected a mapping, got false \(null switches it off\)"),
+    ],
+)
+def test_a_table_in_which_the_arm_would_stand_is_refused(make: Make, tmp_path: Path, override: str, fault: str) -> None:
+    with pytest.raises(ConfigError, match=fault):
+        make(override, text=robot_yaml(tmp_path))
+
+
+def test_a_table_below_the_arm_or_at_its_foot_is_right(make: Make, tmp_path: Path) -> None:
+    for floor in ("-0.5", "0.0", "0.05"):
+        make(f"robot.description.floor={floor}", text=robot_yaml(tmp_path))

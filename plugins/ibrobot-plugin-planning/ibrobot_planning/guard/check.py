@@ -38,7 +38,7 @@ def faults(config: RobotConfig) -> Iterator[OptionFault]:
 
 def floors(config: RobotConfig) -> Iterator[tuple[Key, float]]:
     """Heights of the table that a YAML states, each with its key [m]."""
-    found: list[tuple[Key, float | None]] = [(("robot", "description", "floor"), config.robot.description.floor)]
+    heights: list[tuple[Key, float | None]] = [(("robot", "description", "floor"), config.robot.description.floor)]
     stated: list[tuple[Key, object]] = [
         (("goals",), goals.options if (goals := config.plugin_sections.get("goals")) is not None else None)
     ]
@@ -46,13 +46,13 @@ def floors(config: RobotConfig) -> Iterator[tuple[Key, float]]:
         stated.append((("control_modes", name, "planner"), None if mode.planner is None else mode.planner.options))
     for key, options in stated:
         if isinstance(options, GoalCheckOptions | RrtConnectOptions):
-            found.append(((*key, "floor"), options.floor))
+            heights.append(((*key, "floor"), options.floor))
     guard = config.control.guard
     if guard is not None and isinstance(guard.options, ClearanceGuardOptions):
-        known = [height for _, height in found]
+        known = [height for _, height in heights]
         # A guard that the YAML does not mention has that of another key.
-        found += [(("control", "guard", "floor"), guard.options.floor)] if guard.options.floor not in known else []
-    yield from ((key, height) for key, height in found if height is not None)
+        heights += [(("control", "guard", "floor"), guard.options.floor)] if guard.options.floor not in known else []
+    yield from ((key, height) for key, height in heights if height is not None)
 
 
 def _first_joint(config: RobotConfig) -> float | None:

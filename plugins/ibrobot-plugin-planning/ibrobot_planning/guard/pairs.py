@@ -116,7 +116,7 @@ class Pairs:
                     self.limits[number] = min(self.limits[number], before.get(name, math.inf))
 
     def note_moved(self, objects: Mapping[str, WorldObject]) -> None:
-        """Have it that objects are elsewhere, of which the loop is told by `move`: for `before`."""
+        """Have it that objects are elsewhere, as the loop learns by `move`: for `before`."""
         for part in self.parts:
             part.objects.update((name, thing) for name, thing in objects.items() if name in part.objects)
 
@@ -167,8 +167,8 @@ class Pairs:
         near = room - np.einsum("pj,pj->p", np.abs(middle - at), levers)
         self._room[of[begins]], self._seen[of[begins]] = np.minimum.reduceat(near, begins), middle
         far = np.maximum(np.abs(least - at), np.abs(most - at)) + strays
-        found: Indices = among[room < np.einsum("pj,pj->p", far, levers)]
-        return found
+        unproved: Indices = among[room < np.einsum("pj,pj->p", far, levers)]
+        return unproved
 
     def still_unproved(self, least: Vector, most: Vector, strays: Vector, among: Indices) -> Indices:
         """Those of some pairs, which have been measured since."""
