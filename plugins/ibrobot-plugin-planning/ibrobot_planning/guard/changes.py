@@ -13,6 +13,8 @@ from ibrobot_core.api import HardwareError, Pose, Quaternion, Vector3
 from ibrobot_planning.world.objects import SIMPLE, Mesh, Shape, Voxels, World, WorldObject
 
 _NAMES: Mapping[type[Any], str] = {kind: name for name, kind in SIMPLE.items()}
+_CELLS, _FEWER_CELLS = ("<i2", "<i8"), 2**15
+"""Types of the indices of cells; the first suffices below a limit, and control reads it in a quarter of the time."""
 _FARTHEST_M = 1000.0
 """Positions farther away are mistakes, and the distances to them are not computed well."""
 
@@ -105,7 +107,8 @@ def _written_shape(shape: Shape) -> list[Any]:
         case Mesh():
             return ["mesh", _text(shape.vertices, "<f8"), _text(shape.triangles, "<i8"), shape.convex]
         case Voxels():
-            return ["voxels", shape.size, _text(shape.cells, "<i8")]
+            kind = _CELLS[0] if np.abs(shape.cells).max() < _FEWER_CELLS else _CELLS[1]
+            return ["voxels", shape.size, _text(shape.cells, kind), kind]
         case _:
             return [_NAMES[type(shape)], *attrs.astuple(shape)]
 
@@ -116,8 +119,8 @@ def _read_shape(values: list[Any]) -> Shape:
         vertices, triangles, convex = rest
         return Mesh(_array(vertices, "<f8"), _array(triangles, "<i8").astype(np.intp), bool(convex))
     if kind == "voxels":
-        size, cells = rest
-        return Voxels(float(size), _array(cells, "<i8"))
+        size, cells, kind = rest
+        return Voxels(float(size), _array(cells, _CELLS[_CELLS.index(kind)]).astype(np.int64))
     simple: Shape = SIMPLE[kind](*rest)
     return simple
 

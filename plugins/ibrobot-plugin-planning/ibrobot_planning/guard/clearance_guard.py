@@ -28,7 +28,7 @@ _DECAY_S = 1.0
 """Time in which the greatest distance from the path is forgotten by a factor of e [s]."""
 _HALVINGS = 3
 """How finely the share of a motion that leads nearer is chosen."""
-_MOST = 400
+_MOST = 300
 """How much is looked at in a tick, which bounds its time; see `Pairs.left`."""
 _MOST_BLOCKING = 24
 """Pairs of which a motion that slides takes account: the nearest ones."""
