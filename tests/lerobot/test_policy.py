@@ -23,6 +23,8 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 from torch._subclasses.fake_tensor import FakeTensorMode
 
+from ibrobot_core.api import pixels
+from ibrobot_core.bus import Bus
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Frame, Policy
 
@@ -222,6 +224,51 @@ def test_inference_of_a_batch_leaves_the_processs_random_numbers_alone(folders: 
     torch.manual_seed(1)
     policy.infer_batch(batch)
     assert torch.equal(torch.rand(3), wanted)
+
+
+def test_an_act_says_what_it_attends_to_and_acts_as_before(folders: dict[str, Path]) -> None:
+    policy = loaded(folders["act"])
+    batch = [policy.preprocess(frame) for frame in frames(policy, 3)]
+    for tensors, together in zip(batch, policy.infer_batch(batch), strict=True):
+        alone = policy.infer(tensors)
+        looks = {name: weights for name, weights in alone.items() if name != "action"}
+        assert {name: weights.shape for name, weights in looks.items()} == {
+            f"attention.{TOP}": (3, 3), f"attention.{WRIST}": (3, 3)
+        }  # fmt: skip
+        assert 0.1 < sum(float(weights.sum()) for weights in looks.values()) < 1.0
+        for name, weights in looks.items():
+            np.testing.assert_allclose(together[name], weights, atol=TOLERANCE)
+        attention = policy._model._attention  # type: ignore[union-attr]
+        attention.take = lambda: [{}]  # type: ignore[method-assign, union-attr]
+        np.testing.assert_array_equal(policy.infer(tensors)["action"], alone["action"])
+        del attention.take  # type: ignore[union-attr]
+    assert set(loaded(folders["diffusion"]).infer(batch_of(folders["diffusion"]))) == {"action"}
+
+
+def batch_of(path: Path) -> dict[str, Any]:
+    policy = make(path)
+    return dict(policy.preprocess(frames(policy, 1)[0]))
+
+
+@pytest.mark.parametrize("is_on", [True, False])
+def test_what_an_act_attends_to_is_published_with_its_answer(folders: dict[str, Path], is_on: bool) -> None:
+    policy = loaded(folders["act"], attention=is_on)
+    context = policy._ctx
+    bus = Bus(context.clock)
+    policy._ctx = attrs.evolve(context, bus=bus)
+    arrived = bus.subscribe("/attention/top")
+    [frame] = frames(policy, 1)
+    outputs = policy.infer(policy.preprocess(frame))
+    assert arrived.drain() == [], "published by what runs beside the robot, wherever the network runs"
+    policy.postprocess(outputs)
+    if not is_on:
+        assert bus.topics() == {}
+        return
+    [received] = arrived.drain()
+    shown = pixels(received.message)[..., 0]
+    weights = outputs[f"attention.{TOP}"]
+    assert shown.max() == 255
+    np.testing.assert_allclose(shown, 255 * weights / weights.max(), atol=1.0)
 
 
 def test_fewer_actions_on_demand(folders: dict[str, Path]) -> None:

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import attrs
 import numpy as np
@@ -34,6 +34,8 @@ from ibrobot_diagnose.pictures import reddened
 from ibrobot_diagnose.window import Asked, Floats, Window
 
 ACTION = "action"
+_ATTENTION = "attention."
+"""Prefix of outputs that say where a model looks in a picture, of shape (h, w)."""
 _log = logging.getLogger("ibrobot.diagnose")
 _MOST, _MOST_OF_PARTS = 8, 3
 """Frames on which the model is asked with changed observations, and with changed parts of a vector."""
@@ -44,14 +46,6 @@ _HERE = "monolithic"
 _PATIENCE_NS = 600_000_000_000
 
 type Values = Mapping[str, NDArray[Any]]
-
-
-@runtime_checkable
-class Attentive(Protocol):
-    """A policy that says where it looks."""
-
-    def attention(self, tensors: Tensors) -> Mapping[str, NDArray[np.float32]]:
-        """Weights of each picture, shape (h, w), for the tensors of `preprocess`."""
 
 
 @attrs.frozen(eq=False)
@@ -187,20 +181,22 @@ class Model:
         Raises:
             PolicyError: if an observation is missing, or the model fails.
         """
-        frame = self._units.frame(attrs.evolve(frame, prompt=prompt))
-        deadline_ns = time.monotonic_ns() + _PATIENCE_NS
-        outputs = self.engine.infer(self.policy.preprocess(frame), next(self._requests), deadline_ns)
-        actions = np.array(self.policy.postprocess(outputs), dtype=np.float64)
+        actions = np.array(self.policy.postprocess(self._outputs(frame, prompt)), dtype=np.float64)
         result: Floats = np.asarray(self._units.radians(ACTION, actions), np.float64)
         return result
 
     def attention(self, frame: Frame) -> Mapping[str, Floats]:
-        """Where the model looks in each picture, camera -> weights, shape (h, w); empty for a model that cannot say."""
-        policy = self.policy
-        if self._asked_there or not isinstance(policy, Attentive) or frame.missing:
+        """What the model attends to in each picture, key -> weights, shape (h, w); empty for one that does not say."""
+        if frame.missing:
             return {}
-        tensors = policy.preprocess(self._units.frame(attrs.evolve(frame, prompt=self.window.prompt)))
-        return {key: np.asarray(weights, np.float64) for key, weights in policy.attention(tensors).items()}
+        outputs = self._outputs(frame, self.window.prompt)
+        looks = {name: np.asarray(array, np.float64) for name, array in outputs.items() if name.startswith(_ATTENTION)}
+        return {name.removeprefix(_ATTENTION): each for name, each in looks.items()}
+
+    def _outputs(self, frame: Frame, prompt: str) -> Tensors:
+        frame = self._units.frame(attrs.evolve(frame, prompt=prompt))
+        deadline_ns = time.monotonic_ns() + _PATIENCE_NS
+        return self.engine.infer(self.policy.preprocess(frame), next(self._requests), deadline_ns)
 
     def again(self) -> Iterator[Again]:
         """Ask every request that was answered again."""

@@ -12,9 +12,8 @@ from ibrobot_provenance.report_page import as_page
 from ibrobot_provenance.reports import Case, Cases, Fix, ReportSection, Table, Text
 from ibrobot_provenance.svg import tag
 
-from ibrobot_core.api import DatasetError
 from ibrobot_diagnose.cause import Shown
-from ibrobot_diagnose.contents import figures
+from ibrobot_diagnose.contents import figures, read_facts, read_sections
 from ibrobot_diagnose.options import CHECK
 
 _ROOM_S = 0.2
@@ -107,7 +106,7 @@ def lines_of(out: Path) -> Sequence[str]:
     Raises:
         DatasetError: if it is damaged.
     """
-    return [str(_read(out)["first"])]
+    return [str(read_facts(out / CHECK)["first"])]
 
 
 def read_contents(out: Path) -> Sequence[ReportSection]:
@@ -116,18 +115,4 @@ def read_contents(out: Path) -> Sequence[ReportSection]:
     Raises:
         DatasetError: if it is damaged.
     """
-    facts = _read(out)
-    try:
-        return contents_of(facts)
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-        raise DatasetError(f"{out / CHECK}: is not a check of a dataset: {error!r}") from None
-
-
-def _read(out: Path) -> dict[str, Any]:
-    try:
-        facts = json.loads((out / CHECK).read_text(encoding="utf-8"))
-        if not isinstance(facts, dict) or "first" not in facts:
-            raise ValueError("it has no first line")
-    except (OSError, ValueError, RecursionError) as error:
-        raise DatasetError(f"{out / CHECK}: cannot be read: {error}") from None
-    return facts
+    return read_sections(out / CHECK, "a check of a dataset", contents_of)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -72,7 +72,7 @@ def lines_of(out: Path) -> Sequence[str]:
     Raises:
         DatasetError: if it is damaged.
     """
-    return [str(_read(out)["first"])]
+    return [str(read_facts(out / REPORT)["first"])]
 
 
 def read_contents(out: Path) -> Sequence[ReportSection]:
@@ -81,21 +81,44 @@ def read_contents(out: Path) -> Sequence[ReportSection]:
     Raises:
         DatasetError: if it is damaged.
     """
-    facts = _read(out)
-    try:
-        return contents_of(facts, facts["plots"], Path(facts["path"]))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DatasetError(f"{out / REPORT}: is not an explanation: {error!r}") from None
+    return read_sections(
+        out / REPORT, "an explanation", lambda facts: contents_of(facts, facts["plots"], Path(facts["path"]))
+    )
 
 
-def _read(out: Path) -> dict[str, Any]:
+def read_facts(file: Path) -> dict[str, Any]:
+    """Read the facts of a report.
+
+    Raises:
+        DatasetError: if it is damaged.
+    """
     try:
-        facts = json.loads((out / REPORT).read_text(encoding="utf-8"))
+        facts = json.loads(file.read_text(encoding="utf-8"))
         if not isinstance(facts, dict) or "first" not in facts:
             raise ValueError("it has no first line")
-    except (OSError, ValueError) as error:
-        raise DatasetError(f"{out / REPORT}: cannot be read: {error}") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise DatasetError(f"{file}: cannot be read: {error}") from None
     return facts
+
+
+def read_sections(
+    file: Path, what: str, contents: Callable[[dict[str, Any]], Sequence[ReportSection]]
+) -> Sequence[ReportSection]:
+    """Read a report.
+
+    Args:
+        file: the file of its facts.
+        what: what the file is, for the error.
+        contents: the sections of the facts.
+
+    Raises:
+        DatasetError: if it is damaged.
+    """
+    facts = read_facts(file)
+    try:
+        return contents(facts)
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+        raise DatasetError(f"{file}: is not {what}: {error!r}") from None
 
 
 def write_report(out: Path, explanation: Explanation, episode: Path) -> None:

@@ -18,6 +18,7 @@ from ibrobot_diagnose.causes.motion import AnswersTremble
 from ibrobot_diagnose.diagnosis import diagnose, installed_causes
 from ibrobot_diagnose.report import Explanation
 from made_runs import Run, window_of
+from numpy.typing import NDArray
 from planted_faults import JOINTS, PICTURES, TIMES, of_top
 
 from ibrobot_core.api import IbrobotError
@@ -115,6 +116,48 @@ def test_of_two_causes_the_one_that_explains_the_other_comes_first():
     slow = diagnose(window_of(Run(seed=9302, cameras=(), latency_s=0.8)), Reference())
     assert [each.name for each in slow.findings][:2] == ["answers_slow", "plan_dry"]
     assert slow.findings[0].evidence.likelihood < slow.findings[1].evidence.likelihood
+
+
+def placed(camera: str, picture: NDArray[Any], t_s: float) -> NDArray[Any]:
+    """A block that is bright once it stands where it belongs."""
+    shown = picture.copy()
+    shown[50:66, 70:86] = 250 if t_s > 3.2 else 20
+    return shown
+
+
+HOLDS: dict[str, Any] = {"gain": {3: 0.6}, "picture": placed, **ONE, "seconds": 7}
+"""A gripper that closes on something, which then stands elsewhere."""
+
+
+@pytest.fixture(scope="module")
+def placing() -> Reference:
+    demos = (Run(seed=each, acts=False, **HOLDS) for each in range(10))
+    return Reference(make_card(window_of(each, f"demo_{each.seed}") for each in demos))
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        pytest.param({"outcome": "failure"}, "unseen_success", id="judged-wrongly"),
+        pytest.param({"outcome": "success"}, "", id="judged-rightly"),
+        pytest.param({"outcome": "failure", "gain": {}}, "", id="held-nothing"),
+        pytest.param({"outcome": "failure", "seconds": 4.2}, "", id="arm-not-back"),
+    ],
+)
+def test_a_success_judged_a_failure_held_something_and_ends_as_the_data_does(changes, named, placing):
+    assert first_of(Run(**{**HOLDS, "seed": 9400, **changes}), placing) == named
+
+
+def test_a_gripper_that_begins_at_its_other_end_is_reversed_whatever_it_does_then(placing):
+    def reversed_gripper(state: NDArray[Any]) -> NDArray[Any]:
+        return state * [1, 1, 1, -1]
+
+    def stays(chunk: NDArray[Any]) -> NDArray[Any]:
+        return np.where([False, False, False, True], -0.9, chunk)
+
+    run = Run(**{**HOLDS, "gain": {}}, seed=9402, outcome="failure", seen=reversed_gripper, answered=stays)
+    (first, *_) = diagnose(window_of(run), placing).findings
+    assert (first.name, first.evidence.likelihood > 0.95) == ("gripper_reversed", True)
 
 
 class Squeaks(Cause):

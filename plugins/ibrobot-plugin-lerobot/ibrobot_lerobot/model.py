@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from ibrobot_core.api import PolicyError, Tensors
 from ibrobot_core.app import check_finite
-from ibrobot_lerobot.checkpoint import ACTION, Checkpoint
+from ibrobot_lerobot.attention import Attention
+from ibrobot_lerobot.checkpoint import ACTION, ATTENTION, Checkpoint
 from ibrobot_lerobot.draws import Draw, Draws, NotByRequest
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy_types import import_others
@@ -64,6 +65,9 @@ class PolicyModel:
         """LeRobot's policy."""
         self._autocast = getattr(torch, options.dtype) if options.dtype in ("bfloat16", "float16") else None
         self._chunk = torch.compile(self.network.predict_action_chunk) if options.compile else None
+        keys = {name: key for key, name in checkpoint.names.items()}
+        cameras = [keys[name] for name in self.network.config.image_features] if checkpoint.type == "act" else []
+        self._attention = Attention(self.network.model, cameras) if cameras and not options.compile else None
         self._draws: Sequence[Draw] = ()
         """The random draws of a single request."""
         self._one_by_one = False
@@ -83,7 +87,7 @@ class PolicyModel:
                 values that are not finite.
         """
         try:
-            [action] = self.predict([tensors])
+            action = self.predict([tensors])[0][ACTION]
         except Exception as error:
             raise PolicyError(
                 f"{self._checkpoint.path}: its first run failed: {type(error).__name__}: {error}"
@@ -98,8 +102,9 @@ class PolicyModel:
         check_finite(f"{self._checkpoint.path}: infer of its first run{hint}", {ACTION: action})
         return action
 
-    def predict(self, batch: Sequence[Tensors]) -> list[NDArray[np.float32]]:
-        """Compute the chunks of requests whose tensors have equal names and shapes; each has shape (1, N, A).
+    def predict(self, batch: Sequence[Tensors]) -> list[dict[str, NDArray[np.float32]]]:
+        """Compute the outputs of requests whose tensors have equal names and shapes: a chunk, shape (1, N, A), and for
+        an ACT with cameras `attention.IMAGE`, shape (h, w), what it attends to there.
 
         The requests form one batch, in which each draws noise with its own seed. Requests with a prefix run one by
         one, because their delays may differ.
@@ -127,38 +132,11 @@ class PolicyModel:
         if len(batch) == 1 and "prefix" not in batch[0]:
             self._draws = draws.made
         result = actions.float().numpy(force=True)
-        return [np.array(result[i : i + 1]) for i in range(len(batch))]
-
-    def attention(self, tensors: Tensors) -> dict[str, NDArray[np.float32]]:
-        """Where the last decoder layer of an ACT looks, over the chunk: camera -> weights, shape (h, w).
-
-        All it looks at sums up to 1, the state included. Empty for other networks.
-        """
-        if self._checkpoint.type != "act" or self._chunk is not None or not self.network.config.image_features:
-            return {}
-        network, cameras = self.network.model, list(self.network.config.image_features)
-        weights: list[torch.Tensor] = []
-        sizes: list[tuple[int, int]] = []
-        hooks = (
-            network.decoder.layers[-1].multihead_attn.register_forward_hook(
-                lambda module, given, output: weights.append(output[1])
-            ),
-            network.encoder_img_feat_input_proj.register_forward_hook(
-                lambda module, given, output: sizes.append((output.shape[-2], output.shape[-1]))
-            ),
-        )
-        try:
-            self.predict([tensors])
-        finally:
-            for hook in hooks:
-                hook.remove()
-        looks = weights[0][0].float().mean(dim=0).numpy(force=True)
-        at = len(looks) - sum(height * width for height, width in sizes)
-        shown: dict[str, NDArray[np.float32]] = {}
-        for camera, (height, width) in zip(cameras, sizes, strict=True):
-            shown[camera] = looks[at : at + height * width].reshape(height, width)
-            at += height * width
-        return shown
+        outputs = [{ACTION: np.array(result[i : i + 1])} for i in range(len(batch))]
+        if self._attention is not None:
+            for output, looks in zip(outputs, self._attention.take(), strict=True):
+                output |= {f"{ATTENTION}{image}": weights for image, weights in looks.items()}
+        return outputs
 
     def inputs(self, batch: Sequence[Tensors]) -> dict[str, Any]:
         """The network's inputs: the requests' tensors on its device, with normalised images."""

@@ -46,6 +46,9 @@ class LeRobotPolicyOptions(Options):
         None, ge=1, help="CPU threads of torch; by default one fewer than the cores, at least 1"
     )
     n_action_steps: int | None = option(None, ge=1, help="number of actions of a chunk to use; by default all")
+    attention: bool = option(
+        True, help="publish what an ACT attends to in each picture on /attention/CAMERA, for the page and recordings"
+    )
     untested: str = option(
         "warn", choices=("warn", "refuse"), help="what to do with a LeRobot that is not one of the tested versions"
     )

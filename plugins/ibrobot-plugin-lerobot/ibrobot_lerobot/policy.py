@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, override
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.api import Context, Frame, PictureCodec, Policy, PolicyError, PolicySpec, Tensors
+from ibrobot_core.api import Context, Frame, Header, Image, PictureCodec, Policy, PolicyError, PolicySpec, Tensors
 from ibrobot_core.app import check_finite, check_tensors
-from ibrobot_lerobot.checkpoint import ACTION, POSTPROCESSOR, PREPROCESSOR, check_weights, hash_weights, read_checkpoint
+from ibrobot_lerobot.checkpoint import ACTION, ATTENTION, POSTPROCESSOR, PREPROCESSOR, check_weights, hash_weights, read_checkpoint
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.quiet import cause, held_back
 from ibrobot_lerobot.steps import read_steps
@@ -170,20 +170,28 @@ class LeRobotPolicy(Policy):
             raise PolicyError(f"{self._options.path} is not loaded: call load() first")
         for tensors in batch:
             self._check(tensors)
-        return [{ACTION: action} for action in self._model.predict(batch)]
-
-    def attention(self, tensors: Tensors) -> Mapping[str, NDArray[np.float32]]:
-        """Where the network looks in each picture for a request's tensors, see `PolicyModel.attention`."""
-        return self._model.attention(tensors) if self._model is not None else {}
+        return list(self._model.predict(batch))
 
     @override
     def postprocess(self, tensors: Tensors) -> NDArray[np.float64]:
+        self._publish(tensors)
         action = np.asarray(tensors[ACTION])
         if self._lerobot is not None and self._post.others:
             action = self._lerobot.postprocess(action)
         else:
             action = self._post({ACTION: action})[ACTION]
         return action[0, : self.spec.chunk_size].astype(np.float64)
+
+    def _publish(self, tensors: Tensors) -> None:
+        """Publish what the network attended to, as `/attention/CAMERA`, white for the most."""
+        if (bus := self._ctx.bus) is None or not self._options.attention:
+            return
+        for name, weights in tensors.items():
+            if name.startswith(ATTENTION):
+                height, width = weights.shape
+                pixels = (255 * weights / max(float(weights.max()), 1e-12)).astype(np.uint8).ravel()
+                shown = Image(Header(self._ctx.clock.now_ns()), height, width, "mono8", width, pixels)
+                bus.publish(f"/attention/{name.rpartition('.')[2]}", shown)
 
     def _check(self, tensors: Tensors) -> None:
         """Check that a request, which may be from an untrusted client, has the tensors that `preprocess` makes."""

@@ -8,16 +8,18 @@ import shutil
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import pytest
 from ibrobot_http.server import HttpServer
 from ibrobot_testing import make_session
-from ibrobot_web.link import FIRST_PICTURE, STATE, STATUS
+from ibrobot_web.link import FIRST_PICTURE, PICTURE_HEAD, RGB, STATE, STATUS
 from ibrobot_web.options import WebOptions
 from ibrobot_web.server.app import make_app
 from ibrobot_web.server.broadcast import Broadcast
 from ibrobot_web.server.drive import Answer, Drive
 from ibrobot_web.server.page_guard import page_guard
 from ibrobot_web.status import AgentCalls, LogLines, status_json
+from numpy.typing import NDArray
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = [
@@ -104,6 +106,12 @@ class Run:
         for channel, message in ((STATUS, found), (STATE, state)):
             self.broadcast.publish(channel, json.dumps(message).encode())
 
+    def publish_picture(self, number: int, picture: NDArray[np.uint8]) -> None:
+        """Show a picture, shape (H, W, 3), RGB."""
+        height, width, _ = picture.shape
+        payload = PICTURE_HEAD.pack(1, width, height, RGB) + picture.tobytes()
+        self.broadcast.publish(FIRST_PICTURE + number, payload)
+
 
 async def no_scene() -> bytes:
     return json.dumps({"bodies": [], "meshes": [], "tips": {}, "problem": "this robot has no model"}).encode()
@@ -153,6 +161,7 @@ async def look() -> None:
         await look_at_one_arm(page, run)
         await look_at_keys(page, run)
         await look_at_messages(page, run)
+        await look_at_attention(page, run)
         await page.locator("#mode summary").click()
         assert await page.get_by_role("button", name="drive by keys keyboard needs a terminal").is_disabled()
         await page.get_by_role("button", name="run the policy pick").click()
@@ -219,6 +228,30 @@ async def look_at_keys(page: Any, run: Run) -> None:
         shown = await page.locator("#dialog kbd").all_inner_texts()
         assert shown == ["Esc", *keys, "1", "2", "3", "?"]
         await page.get_by_role("button", name="Close").click()
+
+
+async def look_at_attention(page: Any, run: Run) -> None:
+    """What a policy attends to lies over the camera's picture in red, when asked for; another camera's is a picture."""
+    topics = ("/camera/top/image", "/attention/top", "/attention/side")
+    cameras = [{"channel": FIRST_PICTURE + i, "topic": topic} for i, topic in enumerate(topics)]
+    run.show(status(cameras=cameras))
+    await until(page, "document.querySelectorAll('figure.picture').length === 2")
+    names = await page.locator("figure.picture").evaluate_all("(every) => every.map((each) => each.dataset.name)")
+    assert names == ["top", "side"]
+    await page.keyboard.press("2")
+    box = page.get_by_label("attention")
+    assert not await box.is_checked()
+    run.publish_picture(0, np.zeros((40, 40, 3), np.uint8))
+    grey = np.zeros((2, 2, 3), np.uint8)
+    grey[0, 0] = 255
+    await box.check()
+    run.publish_picture(1, grey)
+    corners = "[1, 38].map((at) => [...document.querySelector('canvas.looks').getContext('2d').getImageData(at, at, 1, 1).data])"
+    await until(page, f"{corners}[0][3] > 100")
+    shown, bare = await page.evaluate(corners)
+    assert shown[0] > 250 and shown[1] < 5 and bare[3] < 20
+    await box.uncheck()
+    assert await page.locator("canvas.looks").is_hidden()
 
 
 def test_pictures_and_controls_are_visible_without_scrolling() -> None:

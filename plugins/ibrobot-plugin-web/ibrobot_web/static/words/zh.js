@@ -40,6 +40,8 @@ export default {
   "no states": "没有状态",
   "ended": "已结束",
   "Camera {}": "相机 {}",
+  "attention": "注意力",
+  "What the policy attends to in the picture of {}": "策略在 {} 画面中所关注之处",
   "{}: waiting for its first picture …": "{}：等待第一幅图像 …",
   "{}: damaged picture": "{}：图像损坏",
   "this browser offers no WebGL 2 here": "此浏览器在这里不提供 WebGL 2",
