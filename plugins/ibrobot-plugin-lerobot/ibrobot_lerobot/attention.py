@@ -22,6 +22,7 @@ class Attention:
         self._cameras = cameras
         self._weights: torch.Tensor | None = None
         self._sizes: list[tuple[int, int]] = []
+        network.register_forward_pre_hook(lambda module, given: self._sizes.clear())
         network.encoder_img_feat_input_proj.register_forward_hook(self._projected)
         network.decoder.layers[-1].multihead_attn.register_forward_hook(self._attended)
 
@@ -35,7 +36,6 @@ class Attention:
         cells = sum(height * width for height, width in self._sizes)
         shown = [self._split(each[-cells:]) for each in looks]
         self._weights = None
-        self._sizes.clear()
         return shown
 
     def _projected(self, module: torch.nn.Module, given: object, output: torch.Tensor) -> None:

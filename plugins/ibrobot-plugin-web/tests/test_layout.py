@@ -12,14 +12,17 @@ import numpy as np
 import pytest
 from ibrobot_http.server import HttpServer
 from ibrobot_testing import make_session
-from ibrobot_web.link import FIRST_PICTURE, PICTURE_HEAD, RGB, STATE, STATUS
+from ibrobot_web.link import FIRST_PICTURE, JPEG, PICTURE_HEAD, STATE, STATUS
 from ibrobot_web.options import WebOptions
+from ibrobot_web.pictures import to_picture
 from ibrobot_web.server.app import make_app
 from ibrobot_web.server.broadcast import Broadcast
 from ibrobot_web.server.drive import Answer, Drive
 from ibrobot_web.server.page_guard import page_guard
 from ibrobot_web.status import AgentCalls, LogLines, status_json
 from numpy.typing import NDArray
+
+from ibrobot_core.api import Header, Image
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = [
@@ -107,9 +110,11 @@ class Run:
             self.broadcast.publish(channel, json.dumps(message).encode())
 
     def publish_picture(self, number: int, picture: NDArray[np.uint8]) -> None:
-        """Show a picture, shape (H, W, 3), RGB."""
-        height, width, _ = picture.shape
-        payload = PICTURE_HEAD.pack(1, width, height, RGB) + picture.tobytes()
+        """Show a grey picture, shape (H, W)."""
+        height, width = picture.shape
+        shown = to_picture(Image(Header(1), height, width, "mono8", width, picture.ravel()))
+        assert shown is not None
+        payload = PICTURE_HEAD.pack(1, 0, 0, JPEG) + shown.content
         self.broadcast.publish(FIRST_PICTURE + number, payload)
 
 
@@ -241,13 +246,15 @@ async def look_at_attention(page: Any, run: Run) -> None:
     await page.keyboard.press("2")
     box = page.get_by_label("attention")
     assert not await box.is_checked()
-    run.publish_picture(0, np.zeros((40, 40, 3), np.uint8))
-    grey = np.zeros((2, 2, 3), np.uint8)
-    grey[0, 0] = 255
+    looks = np.zeros((16, 16), np.uint8)
+    looks[:8, :8] = 255
     await box.check()
-    run.publish_picture(1, grey)
-    corners = "[1, 38].map((at) => [...document.querySelector('canvas.looks').getContext('2d').getImageData(at, at, 1, 1).data])"
-    await until(page, f"{corners}[0][3] > 100")
+    corners = """[1, 38].map((at) =>
+        [...document.querySelector('canvas.looks').getContext('2d').getImageData(at, at, 1, 1).data])"""
+    while (await page.evaluate(corners))[0][3] < 100:
+        run.publish_picture(0, np.zeros((40, 40), np.uint8))
+        run.publish_picture(1, looks)  # until the page's wish to see it has arrived
+        await asyncio.sleep(0.02)
     shown, bare = await page.evaluate(corners)
     assert shown[0] > 250 and shown[1] < 5 and bare[3] < 20
     await box.uncheck()
