@@ -103,8 +103,9 @@ class PolicyModel:
         return action
 
     def predict(self, batch: Sequence[Tensors]) -> list[dict[str, NDArray[np.float32]]]:
-        """Compute the outputs of requests whose tensors have equal names and shapes: a chunk, shape (1, N, A), and for
-        an ACT with cameras `attention.IMAGE`, shape (h, w), what it attends to there.
+        """Compute the outputs of requests whose tensors have equal names and shapes.
+
+        Each has a chunk, shape (1, N, A), and for an ACT with cameras what it attends to in each image, shape (h, w).
 
         The requests form one batch, in which each draws noise with its own seed. Requests with a prefix run one by
         one, because their delays may differ.

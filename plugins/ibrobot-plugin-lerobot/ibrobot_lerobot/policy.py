@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 
 from ibrobot_core.api import Context, Frame, Header, Image, PictureCodec, Policy, PolicyError, PolicySpec, Tensors
 from ibrobot_core.app import check_finite, check_tensors
-from ibrobot_lerobot.checkpoint import ACTION, ATTENTION, POSTPROCESSOR, PREPROCESSOR, check_weights, hash_weights, read_checkpoint
+from ibrobot_lerobot.checkpoint import (
+    ACTION,
+    ATTENTION,
+    POSTPROCESSOR,
+    PREPROCESSOR,
+    check_weights,
+    hash_weights,
+    read_checkpoint,
+)
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.quiet import cause, held_back
 from ibrobot_lerobot.steps import read_steps

@@ -256,7 +256,9 @@ async def look_at_attention(page: Any, run: Run) -> None:
         run.publish_picture(1, looks)  # until the page's wish to see it has arrived
         await asyncio.sleep(0.02)
     shown, bare = await page.evaluate(corners)
-    assert shown[0] > 250 and shown[1] < 5 and bare[3] < 20
+    assert shown[0] > 250, "red"
+    assert shown[1] < 5
+    assert bare[3] < 20
     await box.uncheck()
     assert await page.locator("canvas.looks").is_hidden()
 
