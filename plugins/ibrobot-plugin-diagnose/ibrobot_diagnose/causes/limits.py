@@ -100,7 +100,7 @@ class GuardHeld(Cause):
         text = f"The guard held the arm back in {100 * share:.0f} % of the run, mostly between {pairs[0]}."
         first_ns = next(since for since, label in window.guarded if label)
         details = tuple(f"{pair}: {held[pair] / NS_PER_S:.1f} s" for pair in pairs[:5])
-        return Evidence(text, 100 * share, "%", 5.0, likelihood(share, 0.05, 0.15), window.since(first_ns), details)
+        return Evidence(text, 100 * share, "%", 10.0, likelihood(share, 0.1, 0.2), window.since(first_ns), details)
 
 
 def _pair(label: str) -> str:
