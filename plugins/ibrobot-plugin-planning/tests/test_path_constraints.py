@@ -166,6 +166,17 @@ def test_lines_keep_constraints_or_end_early(planner, engine):
     )
 
 
+def test_lines_with_a_free_orientation_keep_constraints(planner, engine):
+    line = LinearGoal((PositionGoal(Vector3(0.14, 0.2, 0.14)),))
+    assert tilt(tips(engine, planner.plan(ask(line)))[1]) > TEN
+    places, axes = tips(engine, planner.plan(ask(ConstrainedGoal(line, UPRIGHT))))
+    assert tilt(axes) <= TEN
+    way, end = places - places[0], places[-1] - places[0]
+    off = np.linalg.norm(way - np.outer(way @ end, end) / (end @ end), axis=1)
+    assert off.max() < 1e-3, "it is straight"
+    np.testing.assert_allclose(places[-1], [0.14, 0.2, 0.14], atol=1e-3)
+
+
 def test_first_alternative_that_keeps_its_constraints_is_taken(planner, engine):
     tilted = ACROSS + TILT
     goals = tuple(ConstrainedGoal(JointGoal(ARM, each), UPRIGHT) for each in (tilted, ACROSS))

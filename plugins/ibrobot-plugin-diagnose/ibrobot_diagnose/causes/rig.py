@@ -447,9 +447,7 @@ class OtherVersions(RigCause):
     """Packages have other versions."""
 
     name, title = "other_versions", "packages have the versions of the reference"
-    remedy = (
-        "Know of it: if all else is equal, the difference may be there. Install those of the reference to see."
-    )
+    remedy = "Know of it: if all else is equal, the difference may be there. Install those of the reference to see."
 
     @override
     def compare_rigs(self, now: Rig, then: Rig) -> Evidence | None:

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import attrs
 import numpy as np
-from ibrobot_kinematics import KinematicModel, Target, UnreachableError, solve
+from ibrobot_kinematics import KinematicModel, Target, ToolConstraints, UnreachableError, solve
 from ibrobot_kinematics.rotations import between, cross, exp, log
 
 from ibrobot_core.api import Vector
 from ibrobot_planning.goals.errors import invalid_goal
-from ibrobot_planning.goals.tool import Tool, pose_matrix, turned, unit, vector
+from ibrobot_planning.goals.tool import HELD_BACK, Tool, pose_matrix, turned, unit, vector
 from ibrobot_planning.planner import PoseGoal, PositionGoal
 
 _STEP_M = 0.004
@@ -40,13 +40,16 @@ class LinearPath:
     """Why it ends early; empty if it is complete."""
 
 
-def linear_path(tool: Tool, waypoints: Sequence[PositionGoal | PoseGoal], start: Vector) -> LinearPath:
+def linear_path(
+    tool: Tool, waypoints: Sequence[PositionGoal | PoseGoal], start: Vector, constraints: ToolConstraints | None = None
+) -> LinearPath:
     """Configurations along straight lines through waypoints; orientations and directions turn evenly.
 
     Args:
         tool: inverse kinematics.
         waypoints: ends of the lines; if one leaves direction or orientation free, they are free along its line.
         start: all joints at the start [rad], shape (J,).
+        constraints: where an orientation is free, it keeps these if it can; the caller checks them.
 
     Raises:
         PlanningError: without waypoints, or for an invalid one.
@@ -66,6 +69,9 @@ def linear_path(tool: Tool, waypoints: Sequence[PositionGoal | PoseGoal], start:
             except UnreachableError as error:
                 reason = str(error)
                 break
+        if constraints is not None and target.rotation is None and not constraints.kept(q, -HELD_BACK):
+            near, done = constraints.projected(q[None], target)
+            q = near[0] if done[0] else q
         ways = np.abs(q - joints[-1])
         if ways.max() > _LARGEST_JUMP:
             joint = tool.model.joint_names[int(ways.argmax())]

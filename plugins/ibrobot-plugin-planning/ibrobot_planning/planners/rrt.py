@@ -338,7 +338,7 @@ class _Plan:
         touching = self.checks.contacts(self.start)
         if touching:
             raise PlanningError(f"the start is in collision: {sentence(touching)}", PlanCode.START_STATE_IN_COLLISION)
-        line = linear_path(self.tool, goal.waypoints, self._whole())
+        line = linear_path(self.tool, goal.waypoints, self._whole(), self._constraints)
         path = line.joints[:, self._order]
         space = self._space(_FINEST_M)
         possible, reason = len(path), line.reason
