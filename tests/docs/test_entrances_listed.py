@@ -30,6 +30,8 @@ STILL_SERVICES = {
     "/record_episode/status", "/record_episode/stop",
     # Tools of agents, which show the robot.
     "look", "state", "wait",
+    # Answers with where objects are.
+    "/find",
     # An operator's answer to a question of a command, from standard input.
     "answer",
     # Answers with what is planned or known.
@@ -46,6 +48,10 @@ OTHER_SERVICES = {
     "ibrobot_kinematics/twist.py: topic": "teleop twist",
     "ibrobot_web/messages.py: name": "",  # commands of pages, see `page_commands`
     "ibrobot_web/ui/context.py: ''": "",  # requests of the page that starts runs
+    "ibrobot_detect/options.py: type_": "",  # reads options
+    # Work on recordings, and in simulation.
+    "ibrobot_mcp/work.py: name": "",
+    **{f"ibrobot_mcp/work.py: f'{{name}}/{part}'": "" for part in ("progress", "result", "cancel")},
 }
 """Where services are declared whose names are computed -> the entrance that they are; empty: none."""
 SUBSCRIBERS = {
@@ -61,10 +67,10 @@ SUBSCRIBERS = {
             "ibrobot_planning/tasks/performing.py", "ibrobot_ros/topics.py", "ibrobot_ros2/inference.py",
             "ibrobot_diagnose/watch.py", "ibrobot_kinematics/tool_pose.py", "ibrobot_web/objects.py",
             "ibrobot_web/viewer.py",
-            "ibrobot_mcp/pictures.py",
+            "ibrobot_mcp/pictures.py", "ibrobot_ros2/run_cameras.py",
             "ibrobot_webxr/images.py", "ibrobot_webxr/server.py", "ibrobot_zenoh/shared_topics.py",
             # The world.
-            "ibrobot_planning/world/clouds.py", "ibrobot_planning/world/frames.py",
+            "ibrobot_planning/world/clouds.py", "ibrobot_kinematics/run_frames.py",
             "ibrobot_planning/world/section.py",
         ),
         "",

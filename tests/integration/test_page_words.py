@@ -7,11 +7,11 @@ import re
 from pathlib import Path
 
 import pytest
+from ibrobot_provenance.processes import Jobs
 from ibrobot_web.server.app import STATIC
 from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.forms import form_of, job_commands
-from ibrobot_web.ui.job_runner import Jobs
 
 pytestmark = pytest.mark.integration
 ENTRY = re.compile(r'^  ("(?:[^"\\]|\\.)*"): ', re.MULTILINE)

@@ -10,11 +10,12 @@ from typing import Any
 
 import aiohttp
 from ibrobot_http.server import HttpServer
+from ibrobot_provenance.processes import Jobs
 from ibrobot_web.options import WebOptions
 from ibrobot_web.server.page_guard import page_guard
+from ibrobot_web.status import without_tokens
 from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.folders import Folders
-from ibrobot_web.ui.job_runner import Jobs
 from ibrobot_web.ui.server import make_app
 
 _WAIT_S = 30.0
@@ -33,7 +34,7 @@ class UiServer:
         self.port = self.guard.listener.port
         opened = Folders(folders)
         options = ("--web", "--set", "viewer.port=0", "--set", "viewer.browser=false")
-        self.ui = Ui(opened, Jobs(opened.first), options)
+        self.ui = Ui(opened, Jobs(opened.first, without_tokens), options)
         self.client: aiohttp.ClientSession
         """Signed in as the operator."""
         self._base = self.guard.listener.url

@@ -9,7 +9,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import attrs
 from ibrobot_provenance.reports import ReportDescriptor
+from ibrobot_provenance.work import WorkDescriptor, Workplace, some_options
 
 from ibrobot_core.api import Descriptor, Late, hookimpl
 from ibrobot_core.app import Command, Kind, SectionDescriptor
@@ -22,6 +24,8 @@ from ibrobot_diagnose.options import (
     PREFLIGHT_EVENTS,
     REPORT,
     SECTION,
+    CheckOptions,
+    ExplainOptions,
     PreflightSection,
 )
 from ibrobot_diagnose.options import KIND as REPORT_KIND
@@ -98,4 +102,31 @@ def ibrobot_reports() -> Iterable[ReportDescriptor]:
         reads=_is_check,
         lines=Late(f"{checks}:lines_of"),
         make=Late(f"{checks}:read_contents"),
+    )
+
+
+def _explained(wanted: Any, place: Workplace) -> ExplainOptions:
+    return ExplainOptions(jobs=1, out=place.out, **attrs.asdict(wanted, recurse=False))
+
+
+def _checked(wanted: Any, place: Workplace) -> CheckOptions:
+    return CheckOptions(jobs=1, out=place.out, **attrs.asdict(wanted, recurse=False))
+
+
+@hookimpl
+def ibrobot_work() -> Iterable[WorkDescriptor]:
+    """Explanations of recorded runs, and checks of datasets, for those who use a run."""
+    yield WorkDescriptor(
+        "explain",
+        summary="Say why a recorded run of a policy failed.",
+        command="explain",
+        options=some_options(ExplainOptions, "episodes", "data", "against"),
+        make=_explained,
+    )
+    yield WorkDescriptor(
+        "check_dataset",
+        summary="Say which episodes of a dataset to look at, and why.",
+        command="datasets check",
+        options=some_options(CheckOptions, "dataset", "least"),
+        make=_checked,
     )

@@ -6,14 +6,14 @@ from collections.abc import Iterable
 
 from ibrobot_core.api import Late, hookimpl
 from ibrobot_core.app import Command, SectionDescriptor
-from ibrobot_mcp.options import McpOptions
+from ibrobot_mcp.options import SECTION, McpOptions
 
 
 @hookimpl
 def ibrobot_sections() -> Iterable[SectionDescriptor]:
     """A door for agents."""
     yield SectionDescriptor(
-        type="mcp",
+        type=SECTION,
         options=McpOptions,
         make=Late("ibrobot_mcp.door:AgentDoor"),
         summary="the robot's services as tools of the Model Context Protocol, within what a person grants",

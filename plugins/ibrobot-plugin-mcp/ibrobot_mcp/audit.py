@@ -33,8 +33,13 @@ def audit_path(session: RunView) -> Path:
     recording = session.config.recording
     if recording is not None:
         return recording.folder / "agents.jsonl"
+    return states_folder() / f"{session.config.robot.name}.jsonl"
+
+
+def states_folder() -> Path:
+    """The user's folder for what agents did in runs without a recording."""
     states = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
-    return states / "ibrobot" / "agents" / f"{session.config.robot.name}.jsonl"
+    return states / "ibrobot" / "agents"
 
 
 class AuditFile:

@@ -7,9 +7,9 @@ import attrs
 from ibrobot_core.api import option
 from ibrobot_core.app import LaunchRequest, ModeOptions, RunHooks, Runtime, installed_plugins, run_robot
 from ibrobot_mcp.door import AgentDoor
+from ibrobot_mcp.options import SECTION
 from ibrobot_mcp.stdio import take_standard_pipes
 
-SECTION = "mcp"
 TASKS = "tasks"
 """A section that serves tasks and their steps, which agents use, if a package offers it."""
 

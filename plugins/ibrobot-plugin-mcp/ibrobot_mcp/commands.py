@@ -12,11 +12,9 @@ from typing import Any
 import attrs
 
 from ibrobot_core.api import IbrobotError, option
-from ibrobot_core.app import Grant, RequestError, confirm, echo
-from ibrobot_mcp.persons import ask, running, sockets_folder
+from ibrobot_core.app import RequestError, confirm, echo
+from ibrobot_mcp.persons import MOVING, ask, running, sockets_folder
 from ibrobot_mcp.tokens import add_token, named_agents, remove_token
-
-MOVING = attrs.fields(Grant).services.default or ()
 
 
 @attrs.frozen(kw_only=True)

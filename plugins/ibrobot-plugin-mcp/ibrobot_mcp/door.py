@@ -19,6 +19,7 @@ from ibrobot_mcp.server import PIPES, AgentServer
 from ibrobot_mcp.stdio import Pipes, serve_pipes
 from ibrobot_mcp.tokens import tokens_folder
 from ibrobot_mcp.web import http_server
+from ibrobot_mcp.work import WorkServices
 
 _CHECK_S = 0.02
 """Interval at which the authority of an agent is checked [s]."""
@@ -51,6 +52,7 @@ class AgentDoor(SessionWorker):
         self.on_end.callback(self._audit.close)
         self._authority.open()
         self.on_end.callback(self._authority.close)
+        self.on_end.callback(WorkServices(self.session).close)
         persons = Persons(self.session)
         self.on_end.callback(persons.close)
         thread = _ServerThread(self)

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from ibrobot_core.api import Robot
 
 
+SECTION = "mcp"
+
+
 @documented
 @attrs.frozen
 class McpOptions(Options):

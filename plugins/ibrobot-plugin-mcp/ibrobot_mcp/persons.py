@@ -7,19 +7,25 @@ import json
 import os
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import attrs
 from ibrobot_ros2.services import plain
 
-from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import RunView, error_text
+from ibrobot_core.api import IbrobotError, did_you_mean
+from ibrobot_core.app import Grant, RequestError, RunView, error_text
 from ibrobot_mcp.tokens import own_folder
 
 SERVICES = ("/agent/arm", "/agent/disarm", "/agent/status")
 _LARGEST = 64 * 1024
 _TIMEOUT_S = 10.0
+_AT_ONCE, _WAITING = 8, 16
+"""Most callers that are answered at the same time, and most others that wait for them."""
+MOVING: tuple[str, ...] = attrs.fields(Grant).services.default or ()
+"""What is granted by default, of what a run serves."""
 
 
 _RUNTIMES = Path("/run/user")
@@ -56,16 +62,20 @@ class Persons:
         self.path.unlink(missing_ok=True)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._socket.bind(str(self.path))
-        self._socket.listen(4)
+        self._socket.listen(_WAITING)
+        self._open: set[socket.socket] = set()
+        self._answering = ThreadPoolExecutor(_AT_ONCE, "person")
         self._thread = threading.Thread(target=self._serve, name="persons", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Stop. Safe to call twice."""
-        with contextlib.suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)
+        for each in (self._socket, *self._open):
+            with contextlib.suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
         self._socket.close()
         self._thread.join()
+        self._answering.shutdown()
         self.path.unlink(missing_ok=True)
 
     def _serve(self) -> None:
@@ -74,20 +84,47 @@ class Persons:
                 connection, _ = self._socket.accept()
             except OSError:  # closed
                 return
-            with connection, contextlib.suppress(OSError, ValueError, RecursionError):
-                connection.settimeout(_TIMEOUT_S)
-                connection.sendall(json.dumps(self._answer(json.loads(_received(connection)))).encode())
+            self._open.add(connection)
+            self._answering.submit(self._answer_at, connection)
+
+    def _answer_at(self, connection: socket.socket) -> None:
+        with connection, contextlib.suppress(OSError, ValueError, RecursionError):
+            connection.settimeout(_TIMEOUT_S)
+            connection.sendall(json.dumps(self._answer(json.loads(_received(connection)))).encode())
+        self._open.discard(connection)
 
     def _answer(self, request: Any) -> Any:
         if not isinstance(request, dict) or request.get("service") not in SERVICES:
             return {"error": f"this socket serves {', '.join(SERVICES)}"}
         try:
+            if request["service"] == "/agent/arm":
+                check_services(self._session, request.get("request"))
             return {"answer": plain(self._session.bus.call(request["service"], request.get("request")))}
         except IbrobotError as error:
             return {"error": str(error)}
         except Exception as error:
             self._session.log.exception("%s failed", request["service"])
             return {"error": f"{request['service']} failed: {error_text(error)}; please report it"}
+
+
+def check_services(session: RunView, grant: Any) -> None:
+    """Check that an agent may be granted the services that a person names.
+
+    Raises:
+        RequestError: for one that nobody serves now, that needs no grant, or that is for persons.
+    """
+    names = grant.get("services") if isinstance(grant, Mapping) else None
+    known = session.bus.services()
+    granted = sorted(name for name, each in known.items() if not (each.reads or each.urgent or each.persons))
+    for name in names if isinstance(names, list | tuple) else ():
+        service = known.get(name) if isinstance(name, str) else None
+        if service is None and name not in MOVING:
+            hint = did_you_mean(str(name), granted, "these can be granted")
+            raise RequestError(f"--allow {name}: nobody serves it in mode {session.mode}{hint}")
+        if service is not None and service.persons:
+            raise RequestError(f"--allow {name}: it is for persons only, and cannot be granted")
+        if service is not None and (service.reads or service.urgent):
+            raise RequestError(f"--allow {name}: it moves nothing, so that it needs no grant")
 
 
 def running(timeout_s: float = _TIMEOUT_S) -> Iterator[Path]:

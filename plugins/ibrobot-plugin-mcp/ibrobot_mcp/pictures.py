@@ -9,11 +9,20 @@ from typing import Any
 import attrs
 import numpy as np
 from ibrobot_ros2.jpeg import fits_jpeg, to_jpeg
+from ibrobot_ros2.run_cameras import camera_info, chosen_cameras, next_pictures
 
-from ibrobot_core.api import CompressedImage, Image, Message, SensorError, TFMessage, TransformStamped, pixels
+from ibrobot_core.api import (
+    CameraInfo,
+    CompressedImage,
+    Image,
+    Message,
+    SensorError,
+    TFMessage,
+    TransformStamped,
+    pixels,
+)
 from ibrobot_core.app import RunView, Subscription
 
-_TYPES = (Image.ros_type, CompressedImage.ros_type)
 _QUALITY = 85
 _DEPTH_M = 4.0
 """Distance that is black in pictures of depth [m]."""
@@ -35,14 +44,9 @@ class Sight:
     frame: str = ""
     note: str = ""
     intrinsics: Mapping[str, Any] | None = None
-    """Width and height [px], and `k`, row by row [px]; None without a calibration."""
+    """Width and height [px], `k`, row by row [px], and the distortion by its model; None without a calibration."""
     poses: list[Mapping[str, Any]] | None = None
     """The transforms from the camera's frame on, as far as they are known: metres, and quaternions x, y, z, w."""
-
-
-def cameras(session: RunView) -> dict[str, str]:
-    """Name of a camera -> its topic."""
-    return {_name(topic): topic for topic, (kind, _) in session.bus.topics().items() if kind in _TYPES}
 
 
 def look(session: RunView, camera: str, timeout_s: float) -> list[Sight]:
@@ -51,23 +55,14 @@ def look(session: RunView, camera: str, timeout_s: float) -> list[Sight]:
     Raises:
         SensorError: without such a camera, or if it sends no picture within `timeout_s` [s].
     """
-    known = cameras(session)
-    if camera and camera not in known:
-        raise SensorError(f"no camera {camera[:80]!r} sends pictures; these do: {', '.join(known) or 'none'}")
-    if not known:
+    wanted = chosen_cameras(session, camera)
+    if not wanted:
         there = [name for name, each in session.config.peripherals.items() if each.kind == "camera"]
         has = f"its cameras are {', '.join(there)}, and none sends pictures" if there else "the robot has no camera"
         raise SensorError(f"{has}; `state` and `world` show the rest")
     with ExitStack() as stack:
         moving = _subscribed(stack, session, "/tf", _TRANSFORMS)
-        wanted = {name: topic for name, topic in known.items() if camera in ("", name)}
-        subscribed = {name: _subscribed(stack, session, topic, 1) for name, topic in wanted.items()}
-        messages = {}
-        for name, subscription in subscribed.items():
-            received = subscription.get(timeout_s)
-            if received is None:
-                raise SensorError(f"camera {name} has sent no picture within {timeout_s:g} s")
-            messages[name] = received.message
+        messages = next_pictures(session, wanted, timeout_s)
         fixed = session.bus.latched().get("/tf_static")
         frames: dict[str, TransformStamped] = {}
         for each in (*([fixed] if fixed is not None else []), *moving.drain()):
@@ -82,11 +77,6 @@ def _subscribed(stack: ExitStack, session: RunView, topic: str, depth: int) -> S
     return subscription
 
 
-def _name(topic: str) -> str:
-    parts = topic.strip("/").split("/")
-    return parts[1] if len(parts) > 2 and parts[0] == "camera" else topic.strip("/").replace("/", "_")
-
-
 def _sight(session: RunView, name: str, topic: str, message: Message, frames: Mapping[str, TransformStamped]) -> Sight:
     if isinstance(message, CompressedImage):
         header, data = message.header, message.data.tobytes()
@@ -97,8 +87,8 @@ def _sight(session: RunView, name: str, topic: str, message: Message, frames: Ma
         deep = message.encoding in ("16UC1", "32FC1")
         note = f"depth: white is 0 m, black is {_DEPTH_M:g} m and more, or unknown" if deep else ""
         data = to_jpeg(message if fits_jpeg(message) else _eight_bits(message), _QUALITY).data.tobytes()
-    info = session.bus.latched().get(f"{topic.rpartition('/')[0]}/camera_info")
-    intrinsics = _intrinsics(info.message) if info is not None else None
+    info = camera_info(session, topic)
+    intrinsics = _intrinsics(info) if info is not None else None
     return Sight(name, header.stamp_ns, data, kind, header.frame_id, note, intrinsics, _poses(frames, header.frame_id))
 
 
@@ -118,8 +108,9 @@ def _eight_bits(message: Image) -> Image:
     return Image(message.header, message.height, message.width, "mono8", message.width, grey.reshape(-1))
 
 
-def _intrinsics(info: Any) -> Mapping[str, Any]:
-    return {"width_px": info.width, "height_px": info.height, "k": [round(float(each), 4) for each in info.k]}
+def _intrinsics(info: CameraInfo) -> Mapping[str, Any]:
+    matrix, distortion = ([round(float(each), 6) for each in values] for values in (info.k, info.d))
+    return {"width_px": info.width, "height_px": info.height, "k": matrix, info.distortion_model: distortion}
 
 
 def _poses(frames: Mapping[str, TransformStamped], frame: str) -> list[Mapping[str, Any]] | None:

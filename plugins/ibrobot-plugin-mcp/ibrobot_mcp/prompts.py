@@ -22,6 +22,25 @@ _TEXTS: Mapping[str, tuple[str, str, str]] = {
         "Call `state`, `world` and `look`, and tell me what you see, where it is in metres in the robot's base frame, "
         "and what the robot could do with it. Move nothing.",
     ),
+    "try_policy": (
+        "Run a policy, and say whether it succeeds.",
+        "mode",
+        "Call `state` and `look`. Run the policy of mode {mode!r} by `run_policy`, until it succeeds and for 30 "
+        "seconds at most, with `record_episode` before and `end_episode` after it if there are such tools. `look` "
+        "again, and tell me what happened. If it failed, call `explain` with the episode.",
+    ),
+    "evaluate": (
+        "Count how often a policy succeeds in simulation.",
+        "mode",
+        "Call `evaluate` with mode {mode!r} and 20 episodes, and `wait` for its result. Tell me the successes with "
+        "their interval, and which episodes failed. Ask me for the authority if it is refused.",
+    ),
+    "why_failed": (
+        "Say why a recorded run failed, and what to do about it.",
+        "episode",
+        "Call `explain` for the episode {episode!r}, of those in ibrobot://episodes, and `wait` for its result. Tell "
+        "me the most probable cause with its number, and what to do, in a few sentences.",
+    ),
 }
 """Name -> what it is for, its argument, and its text."""
 PROMPTS = tuple(

@@ -43,6 +43,8 @@ _OPEN = 8
 """Calls of all agents that are carried out at the same time; others wait."""
 _READING, _NICE = 2, 10
 """Threads for services that read, e.g. plan: one for an agent at a time; and their niceness."""
+_COUNTED = ("tools/call", "resources/read")
+"""Requests that are counted where they are answered: stops are not."""
 _WAITING = 32
 """Calls of an agent that may wait."""
 _EACH = 4
@@ -64,12 +66,27 @@ class Allowance:
     reading: asyncio.Lock = attrs.field(factory=asyncio.Lock)
     """Held while a service reads for it."""
 
-    def refusal(self) -> str:
-        """Count a call; why it is refused, or empty."""
+    others: float = _BURST
+    """Requests that are no calls, e.g. lists of tools, in floods of which the stop of another agent would wait."""
+
+    def other(self) -> str:
+        """Count a request that is no call; why it is refused, or empty."""
+        self._grow()
+        if self.others < 1.0:
+            return f"more than {_PER_SECOND:g} requests per second: ask less often"
+        self.others -= 1.0
+        return ""
+
+    def _grow(self) -> None:
         now_s = time.monotonic()
         passed_s, self.counted_s = now_s - self.counted_s, now_s
         self.calls = min(_BURST, self.calls + passed_s * _PER_SECOND)
+        self.others = min(_BURST, self.others + passed_s * _PER_SECOND)
         self.computing_s = min(_AT_ONCE_S, self.computing_s + passed_s * _SHARE)
+
+    def refusal(self) -> str:
+        """Count a call; why it is refused, or empty."""
+        self._grow()
         if self.calls < 1.0:
             return f"more than {_PER_SECOND:g} calls per second: call less often"
         if self.computing_s < 0.0:
@@ -134,9 +151,11 @@ class AgentServer:
             on_list_tools=self._list_tools,
             on_call_tool=self._call_tool,
             on_list_resources=self._list_resources,
+            on_list_resource_templates=self._list_resource_templates,
             on_read_resource=self._read_resource,
             on_list_prompts=self._list_prompts,
             on_get_prompt=self._get_prompt,
+            get_tool_input_schema=lambda name: None,  # else each call, also a stop, would list all tools first
         )
         self.protocol.middleware.append(self._heard)
 
@@ -190,7 +209,15 @@ class AgentServer:
             self._authority.renew(client.agent)
         while not self._run.bus.serves(SET_MODE):  # the run starts, or ends
             await asyncio.sleep(_START_S)
+        if ctx.request_id is not None and ctx.method not in _COUNTED and (why := self._allowance(ctx).other()):
+            raise MCPError(code=types.INTERNAL_ERROR, message=why)
         return await call_next(ctx)
+
+    def _allowance(self, ctx: Any) -> Allowance:
+        """What the agent of a request may use."""
+        caller = _caller(ctx)
+        name = "" if caller is None else caller.client_id
+        return self._allowances.setdefault(name, Allowance(time.monotonic()))
 
     async def _client(self, ctx: Any) -> Client:
         key = _key(ctx)
@@ -200,8 +227,7 @@ class AgentServer:
             stated = info.client_info.name if info is not None else ""
             name, token = (caller.client_id, caller.token) if caller is not None else ("", "")
             agent = self._authority.join(name or stated)
-            allowance = self._allowances.setdefault(name, Allowance(time.monotonic()))
-            self._clients[key] = Client(agent, allowance, name, token)
+            self._clients[key] = Client(agent, self._allowance(ctx), name, token)
             of_name = [other for other, each in self._clients.items() if name and each.name == name]
             for other in sorted(of_name, key=lambda each: self._clients[each].agent.heard_ns)[: -_EACH or None]:
                 await self.leave(other)
@@ -211,8 +237,7 @@ class AgentServer:
 
     async def _list_tools(self, ctx: Any, params: Any) -> types.ListToolsResult:
         await self._client(ctx)
-        tools = [tool.described(name) for name, tool in sorted(self._tools.all().items())]
-        return types.ListToolsResult(tools=tools)
+        return types.ListToolsResult(tools=self._tools.described())
 
     async def _call_tool(self, ctx: Any, params: types.CallToolRequestParams) -> types.CallToolResult:
         client = await self._client(ctx)
@@ -273,6 +298,9 @@ class AgentServer:
 
     async def _list_resources(self, ctx: Any, params: Any) -> types.ListResourcesResult:
         return types.ListResourcesResult(resources=self._resources.all())
+
+    async def _list_resource_templates(self, ctx: Any, params: Any) -> types.ListResourceTemplatesResult:
+        return types.ListResourceTemplatesResult(resource_templates=self._resources.templates())
 
     async def _read_resource(self, ctx: Any, params: types.ReadResourceRequestParams) -> types.ReadResourceResult:
         client = await self._client(ctx)

@@ -13,12 +13,13 @@ from typing import Any, get_args
 import attrs
 import mcp_types as types
 from ibrobot_provenance.option_schemas import OptionSchemas
+from ibrobot_ros2.run_cameras import cameras
 from ibrobot_ros2.services import plain
 
 from ibrobot_core.api import IbrobotError, documented, option, seconds
 from ibrobot_core.app import Agent, RequestError, RunView, Service, fields
 from ibrobot_mcp.audit import authority_of
-from ibrobot_mcp.pictures import Sight, cameras, look
+from ibrobot_mcp.pictures import Sight, look
 
 NAMES: Mapping[str, str] = {
     "/planning/go_to": "go_to",
@@ -131,6 +132,10 @@ class Tools:
     def __init__(self, session: RunView) -> None:
         self._session = session
         self._authority = authority_of(session)
+        self._of: Mapping[str, Service[Any, Any]] | None = None
+        """The services of the tools."""
+        self._all: dict[str, RobotTool] = {}
+        self._described: list[types.Tool] = []
         self._own: dict[str, RobotTool] = {
             "state": RobotTool(
                 Service("state", State, dict, "Mode, joints, faults, and what to do about them.", reads=True),
@@ -148,16 +153,31 @@ class Tools:
 
     def all(self) -> dict[str, RobotTool]:
         """The tools in the robot's present mode, by name."""
+        self._renew()
+        return self._all
+
+    def described(self) -> list[types.Tool]:
+        """Their descriptions."""
+        self._renew()
+        return self._described
+
+    def _renew(self) -> None:
+        """Make the tools of the services that are served now, unless it is done: agents list them in floods."""
+        services = self._session.bus.services()
+        if services == self._of:
+            return
         served = {
             tool_name(name): RobotTool(service, self._caller(service), _way(service))
-            for name, service in self._session.bus.services().items()
+            for name, service in services.items()
             if not service.persons and name not in _LEFT_OUT
         }
-        return {**served, **self._steps(), **self._own}
+        self._all = {**served, **self._steps(services), **self._own}
+        self._described = [tool.described(name) for name, tool in sorted(self._all.items())]
+        self._of = services
 
-    def _steps(self) -> dict[str, RobotTool]:
+    def _steps(self, services: Mapping[str, Service[Any, Any]]) -> dict[str, RobotTool]:
         """A tool for each kind of step that tasks have."""
-        step = self._session.bus.services().get(STEP)
+        step = services.get(STEP)
         tools = {}
         for name, field in fields(step.request).items() if step is not None else ():
             kinds = [each for each in get_args(field.type) if isinstance(each, type) and attrs.has(each)]
@@ -201,7 +221,8 @@ class Tools:
         if result is not None:
             return {"number": number, "result": plain(result)}
         way = f"it is under way: call wait with tool {tool_name(service.name)}, number {number}"
-        return {"number": number, "result": None, "next": way}
+        progress = {} if service.progress is None else {"progress": plain(self._session.bus.call(service.progress))}
+        return {"number": number, "result": None, **progress, "next": way}
 
     def _state(self) -> Mapping[str, Any]:
         session = self._session

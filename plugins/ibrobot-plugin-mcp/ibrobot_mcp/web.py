@@ -10,6 +10,7 @@ from typing import Any
 import anyio
 import anyio.to_thread
 from aiohttp import web
+from anyio.abc import TaskGroup, TaskStatus
 from ibrobot_http.guard import Guard
 from ibrobot_http.listener import Listener
 from ibrobot_http.server import HttpServer
@@ -23,7 +24,8 @@ from ibrobot_mcp.tokens import agent_of
 PATH = "/mcp"
 _LARGEST = 1024 * 1024
 """Largest request [bytes]."""
-_SESSIONS = 16
+_SESSIONS = 8
+"""Most sessions of an agent, in the protocols that have some; more are refused with 503, and no other agent is."""
 _IDLE_S = 600.0
 """Time without a request after which a session ends [s]."""
 _NO_TOKEN = "this server needs `Authorization: Bearer TOKEN`; `ibrobot agent add NAME` makes the token of an agent\n"
@@ -34,10 +36,6 @@ _READS = 4
 @contextlib.asynccontextmanager
 async def http_server(server: AgentServer, listener: Listener) -> AsyncIterator[None]:
     """Serve agents over HTTP until the block ends."""
-    manager = StreamableHTTPSessionManager(
-        server.protocol, session_idle_timeout=_IDLE_S, max_sessions=_SESSIONS, max_request_body_size=_LARGEST
-    )
-
     reads = anyio.CapacityLimiter(_READS)
 
     async def answer(request: web.Request) -> web.StreamResponse:
@@ -47,6 +45,7 @@ async def http_server(server: AgentServer, listener: Listener) -> AsyncIterator[
             return web.Response(status=401, text=_NO_TOKEN, headers={"WWW-Authenticate": "Bearer"})
         # The SDK lets nobody else use a session of this user.
         user = AuthenticatedUser(AccessToken(token=token, client_id=name, scopes=[]))
+        manager = await managers.of(name)
         response = await _asgi(manager.handle_request, request, user)
         if request.method == "DELETE":
             await server.leave(key_of(name, request.headers.get("mcp-session-id", "")))
@@ -55,8 +54,40 @@ async def http_server(server: AgentServer, listener: Listener) -> AsyncIterator[
     app = web.Application(client_max_size=_LARGEST)
     for method in ("GET", "POST", "DELETE"):
         app.router.add_route(method, PATH, answer)
-    async with manager.run(), HttpServer(Guard(listener), app):
-        yield
+    async with anyio.create_task_group() as group:
+        managers = _Managers(server, group)
+        async with HttpServer(Guard(listener), app):
+            yield
+        group.cancel_scope.cancel()
+
+
+class _Managers:
+    """The sessions of each agent, which the SDK manages, so that none can take those of others.
+
+    Args:
+        server: answers the agents.
+        group: in which they run.
+    """
+
+    def __init__(self, server: AgentServer, group: TaskGroup) -> None:
+        self._server, self._group = server, group
+        self._known: dict[str, StreamableHTTPSessionManager] = {}
+        self._making = anyio.Lock()
+
+    async def of(self, name: str) -> StreamableHTTPSessionManager:
+        """The sessions of an agent."""
+        async with self._making:
+            if name not in self._known:
+                self._known[name] = await self._group.start(self._run)
+            return self._known[name]
+
+    async def _run(self, *, task_status: TaskStatus[StreamableHTTPSessionManager]) -> None:
+        manager = StreamableHTTPSessionManager(
+            self._server.protocol, session_idle_timeout=_IDLE_S, max_sessions=_SESSIONS, max_request_body_size=_LARGEST
+        )
+        async with manager.run():
+            task_status.started(manager)
+            await anyio.sleep_forever()
 
 
 async def _asgi(

@@ -209,7 +209,7 @@ def test_session_of_another_agent_is_of_no_use(door: AgentDoor, token: str) -> N
             client(http, door, "legacy") as armed,
         ):
             await armed.list_tools()
-            ask(next(running()), "/agent/arm", {"seconds": 60, "services": ["/test/move"]})
+            ask(next(running()), "/agent/arm", {"seconds": 60, "services": ["/set_mode"]})
             stolen = {"Authorization": f"Bearer {other}", "mcp-session-id": sessions[0]}
             call = {"jsonrpc": "2.0", "id": 9, "method": "tools/call", "params": {"name": "state", "arguments": {}}}
             more = {"Accept": "application/json, text/event-stream"}
@@ -235,7 +235,7 @@ def test_agent_whose_token_is_taken_away_is_disconnected_and_its_authority_ends(
     async def talk() -> None:
         async with bearer(token) as http, client(http, door, mode) as armed:
             await armed.list_tools()
-            ask(next(running()), "/agent/arm", {"seconds": 60, "services": ["/test/move"], "lease": 100})
+            ask(next(running()), "/agent/arm", {"seconds": 60, "services": ["/set_mode"], "lease": 100})
             remove_token("claude")
             while authority.status().agents:
                 await asyncio.sleep(0.01)
@@ -258,7 +258,7 @@ def test_token_is_taken_away_though_pings_have_no_answer(door: AgentDoor, token:
     async def talk() -> None:
         async with bearer(token) as http, client(http, door, "legacy") as armed:
             await armed.list_tools()
-            ask(next(running()), "/agent/arm", {"seconds": 60, "services": ["/test/move"], "lease": 100})
+            ask(next(running()), "/agent/arm", {"seconds": 60, "services": ["/set_mode"], "lease": 100})
             await asyncio.to_thread(pinged.wait)
             remove_token("claude")
             while authority.status().agents:
@@ -626,7 +626,7 @@ def test_full_disk_ends_the_authority_and_loses_nothing_in_silence(
     authority.join("claude")
     while not door._audit.trouble:
         threading.Event().wait(0.001)
-    grant = {"seconds": 60, "services": ["/test/move"]}
+    grant = {"seconds": 60, "services": ["/set_mode"]}
     with pytest.raises(HardwareError, match=r"cannot be written: .*No space left on device; nothing was granted"):
         door.session.bus.call("/agent/arm", grant)
     assert authority.status().armed == ""
@@ -666,7 +666,7 @@ def test_slow_disk_delays_no_end_of_an_authority_and_loses_nothing(
     door.start()
     authority = authority_of(door.session)
     agent = authority.join("claude")
-    door.session.bus.call("/agent/arm", {"seconds": 60, "services": ["/test/move"]})
+    door.session.bus.call("/agent/arm", {"seconds": 60, "services": ["/set_mode"]})
     door.step(0)
     assert authority.status().armed == "1:claude"
     monkeypatch.setattr(audit, "LATE_S", 0.0)
@@ -687,7 +687,7 @@ def test_log_that_is_removed_is_begun_again(door: AgentDoor, folders: Path) -> N
         threading.Event().wait(0.01)
     path.unlink()
     path.parent.rmdir()
-    ask(next(running()), "/agent/arm", {"seconds": 60, "services": ["/test/move"]})
+    ask(next(running()), "/agent/arm", {"seconds": 60, "services": ["/set_mode"]})
     door.stop()
     assert [json.loads(line)["event"] for line in path.read_text().splitlines()] == ["armed", "ended"]
 

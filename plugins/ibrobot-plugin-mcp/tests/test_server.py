@@ -150,6 +150,30 @@ def test_agent_that_computes_much_is_refused_until_its_share_has_grown(
     assert rig.moves == ["stop"] * 9
 
 
+def test_a_flood_of_lists_is_refused_and_stops_and_calls_are_not(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ibrobot_mcp.server.time.monotonic", lambda: 100.0)
+
+    async def act(client: Client) -> None:
+        await client.list_tools()  # the client keeps them
+        for _ in range(97):
+            await client.list_resources()
+        with pytest.raises(MCPError, match="more than 50 requests per second: ask less often"):
+            [await client.list_resources() for _ in range(5)]
+        assert not (await client.call_tool("test_state", {})).is_error
+        assert not (await client.call_tool("stop", {})).is_error
+
+    rig.talk(act)
+    assert rig.moves == ["stop"]
+
+
+def test_tools_are_made_again_only_when_the_services_have_changed(rig: Rig) -> None:
+    tools = rig.server._tools
+    assert tools.described() is tools.described()
+    rig.session.bus.unserve(STATE)
+    assert "test_state" not in {each.name for each in tools.described()}
+    assert "test_state" not in tools.all()
+
+
 class Slow:
     """A service that reads, and waits at each call until it may go on."""
 
@@ -235,14 +259,25 @@ def test_service_with_a_bug_is_reported_and_ends_nothing(rig: Rig, caplog: pytes
 def test_resources_and_prompts(rig: Rig) -> None:
     async def act(client: Client) -> None:
         found = {each.uri for each in (await client.list_resources()).resources}
-        assert found == {"ibrobot://robot", "ibrobot://services", "ibrobot://episodes"}
+        names = ("robot", "services", "episodes", "datasets", "evaluations", "documentation")
+        assert found == {f"ibrobot://{name}" for name in names}
+        templates = {each.uri_template for each in (await client.list_resource_templates()).resource_templates}
+        assert templates == {"ibrobot://evaluations/{name}", "ibrobot://documentation/{name}"}
+        packages = json.loads(contents(await client.read_resource("ibrobot://documentation")))["packages"]
+        assert packages["ibrobot-plugin-mcp"].startswith("A robot for language models")
+        assert "# ibrobot-plugin-mcp" in contents(
+            await client.read_resource("ibrobot://documentation/ibrobot-plugin-mcp")
+        )
+        for wrong in ("documentation/pip", "documentation/../robot", "evaluations/none", "evaluations/"):
+            with pytest.raises(MCPError, match="there is no "):
+                await client.read_resource(f"ibrobot://{wrong}")
         services = json.loads(contents(await client.read_resource("ibrobot://services")))
         assert services["/test/forget"]["persons"] is True
         assert "no section `recording`" in contents(await client.read_resource("ibrobot://episodes"))
         with pytest.raises(MCPError, match="there is no resource 'file:///etc/passwd'"):
             await client.read_resource("file:///etc/passwd")
         prompts = {each.name for each in (await client.list_prompts()).prompts}
-        assert prompts == {"pick", "look_around"}
+        assert prompts == {"pick", "look_around", "try_policy", "evaluate", "why_failed"}
         asked = await client.get_prompt("pick", {"object": "cube"})
         assert "Pick up the object named 'cube'" in str(asked.messages[0].content)
         with pytest.raises(MCPError, match="give the argument object"):

@@ -15,12 +15,13 @@ import aiohttp
 import attrs
 import pytest
 from ibrobot_http.server import ServerThread
+from ibrobot_provenance.processes import Jobs
 from ibrobot_testing.http import HttpSuite, Served
 from ibrobot_web.options import WebOptions
 from ibrobot_web.server.page_guard import page_guard
+from ibrobot_web.status import without_tokens
 from ibrobot_web.ui.context import Ui, request_of
 from ibrobot_web.ui.folders import Folders
-from ibrobot_web.ui.job_runner import Jobs
 from ibrobot_web.ui.server import LARGEST_REQUEST, ROUTED, make_app, routes_of
 from ui_server import UiServer, run_ui
 
@@ -71,7 +72,7 @@ class TestAttacks(HttpSuite):
         with patch("ibrobot_http.guard.REQUEST_S", request_s), tempfile.TemporaryDirectory() as folder:
             guard = page_guard(WebOptions(port=0), any_port="0")
             opened = Folders([Path(folder)])
-            with contextlib.closing(Ui(opened, Jobs(opened.first), ())) as ui:
+            with contextlib.closing(Ui(opened, Jobs(opened.first, without_tokens), ())) as ui:
                 with contextlib.closing(ServerThread(guard, make_app(guard, ui), "ui", close_s=0.1)):
                     yield Served(
                         guard.listener.url,

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 import yaml
+from ibrobot_provenance.processes import Jobs
 from ibrobot_web.model_edit import with_model
 from ibrobot_web.ui.context import Ui, read_facts
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.forms import read_form
-from ibrobot_web.ui.job_runner import Jobs
 from ibrobot_web.ui.recordings import Episodes
 from ibrobot_web.ui.server import routes_of
 from ui_server import UiServer, run_ui

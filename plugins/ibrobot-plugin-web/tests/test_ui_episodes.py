@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import CliRunner
+from ibrobot_provenance.processes import IBROBOT
 from ibrobot_testing.command import command_line
 from ibrobot_web.playback import Playback
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.forms import choices_of
-from ibrobot_web.ui.job_runner import IBROBOT
 from ibrobot_web.ui.recordings import Episodes, find_recordings
 from ui_server import UiServer, run_ui
 

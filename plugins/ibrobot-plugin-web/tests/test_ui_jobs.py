@@ -11,12 +11,12 @@ from typing import Any, override
 import attrs
 import pytest
 from ibrobot_provenance.asking import Ask
+from ibrobot_provenance.processes import Jobs, arguments
 from ibrobot_testing.command import command_line
 from ibrobot_web.ui import forms
 from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.folders import Folders
-from ibrobot_web.ui.forms import arguments, form_of, in_page_words, read_form
-from ibrobot_web.ui.job_runner import Jobs
+from ibrobot_web.ui.forms import form_of, in_page_words, read_form
 from ibrobot_web.ui.jobs import answer, event_reader, sight
 
 from ibrobot_core.api import IbrobotError, MissingDependency, option

@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from ibrobot_provenance.processes import IBROBOT
 from ibrobot_terminal import GuideDescriptor, Question
 from ibrobot_web.ui import robots
-from ibrobot_web.ui.job_runner import IBROBOT
 from ui_server import UiServer, run_ui
 
 ROBOT = """# A pan axis: it turns a camera.

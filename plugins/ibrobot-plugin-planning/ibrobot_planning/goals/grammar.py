@@ -11,6 +11,7 @@ import numpy as np
 from ibrobot_kinematics import PathConstraints
 from ibrobot_kinematics.poses import homogeneous, matrix, pose
 from ibrobot_kinematics.rotations import from_quaternion, from_rpy
+from ibrobot_kinematics.run_frames import BASE_FRAMES
 
 from ibrobot_core.api import PlanningError, Pose, Vector, Vector3, documented, option
 from ibrobot_core.app import PlanCode
@@ -24,7 +25,7 @@ from ibrobot_planning.planner import (
     PoseGoal,
     PositionGoal,
 )
-from ibrobot_planning.world.objects import BASE_FRAMES, World
+from ibrobot_planning.world.objects import World
 from ibrobot_planning.world.options import FURTHEST
 
 type Triple = tuple[float, float, float]

@@ -10,6 +10,7 @@ from typing import Any, override
 import attrs
 import numpy as np
 from ibrobot_kinematics.poses import matrix
+from ibrobot_kinematics.run_frames import Frames, UnknownFrame
 
 from ibrobot_core.api import (
     CameraInfo,
@@ -30,7 +31,6 @@ from ibrobot_core.app import CONTROL, NoRequest, Received, RunView, Service, Ses
 from ibrobot_planning.world.ages import Age, AgeSummary, Unusable
 from ibrobot_planning.world.arm import robot_arm
 from ibrobot_planning.world.coal_shapes import geometry
-from ibrobot_planning.world.frames import Frames
 from ibrobot_planning.world.objects import Voxels, WorldObject
 from ibrobot_planning.world.options import CloudOptions, WorldOptions
 from ibrobot_planning.world.section import WorldKeeper
@@ -239,7 +239,10 @@ class _Cloud:
         assert isinstance(message, PointCloud2 | Image)
         seen = self._cloud(message) if isinstance(message, PointCloud2) else self._image(message)
         self._check_covered(seen)
-        placed = frames.pose(options.frame or message.header.frame_id, measured_ns, options.transform_tolerance)
+        try:
+            placed = frames.pose(options.frame or message.header.frame_id, measured_ns, options.transform_tolerance)
+        except UnknownFrame as error:
+            raise Unusable("unknown frame", str(error)) from error
         points = seen.points[np.linalg.norm(seen.points, axis=1) <= options.furthest]
         points = points @ placed[:3, :3].T + placed[:3, 3]
         points = points[np.linalg.norm(points, axis=1) <= options.reach]

@@ -18,8 +18,6 @@ from ibrobot_core.api import PlanningError, Pose, Vector
 from ibrobot_core.app import Bus, NoRequest, PlanCode, Service
 from ibrobot_planning.world.ages import AgeSummary
 
-BASE_FRAMES = ("", "base", "base_link")
-"""Names of the base frame."""
 FLOOR = "floor"
 """Name of the object that the option `floor` of a planner adds."""
 _LARGEST_M = 100.0

@@ -11,15 +11,16 @@ from pathlib import Path
 
 import attrs
 from ibrobot_http.server import HttpServer
+from ibrobot_provenance.processes import Jobs
 
 from ibrobot_core.api import option
 from ibrobot_core.app import LogFormatter, RequestError, echo, end_signals
 from ibrobot_web.desktop import open_browser
 from ibrobot_web.options import WebOptions
 from ibrobot_web.server.page_guard import page_guard
+from ibrobot_web.status import without_tokens
 from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.folders import Folders
-from ibrobot_web.ui.job_runner import Jobs
 from ibrobot_web.ui.server import make_app
 
 
@@ -53,7 +54,7 @@ class ServeUi:
         handler = logging.StreamHandler(sys.stderr)
         handler.setFormatter(LogFormatter("%(levelname).1s %(message)s"))
         logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
-        context = Ui(opened, Jobs(opened.first), _run_options(options))
+        context = Ui(opened, Jobs(opened.first, without_tokens), _run_options(options))
         try:
             asyncio.run(_serve(options, context, browser=not self.no_browser))
         finally:

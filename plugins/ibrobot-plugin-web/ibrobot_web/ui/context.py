@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 import attrs
+from ibrobot_provenance.processes import Jobs
 
 from ibrobot_core.app import RequestError, RequestLimits, Service
 from ibrobot_web.ui.folders import Folders
-from ibrobot_web.ui.job_runner import Jobs
 
 
 @attrs.frozen(eq=False)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin
 
 import attrs
+from ibrobot_provenance.processes import IBROBOT, arguments
 
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import (
@@ -25,7 +26,6 @@ from ibrobot_core.app import (
     read_options,
 )
 from ibrobot_web.ui.context import Ui
-from ibrobot_web.ui.job_runner import IBROBOT
 from ibrobot_web.ui.recordings import Episodes, find_policies, find_recordings
 from ibrobot_web.ui.robots import robot_names, robot_of
 
@@ -105,21 +105,6 @@ def read_form(ui: Ui, command: Command, values: Mapping[str, Any]) -> Any:
             raise IbrobotError(f"{label_of(name, shown[name])}: {value!r} is no name")
     labels = {name: label_of(name, field) for name, field in shown.items()}
     return read_options(command.options, plain, ui.folders.find, labels)
-
-
-def arguments(options: Any) -> list[str]:
-    """The arguments of a command line that give these options."""
-    flags: list[str] = []
-    operands: list[str] = []
-    values = attrs.asdict(options, recurse=False)
-    for name, field in fields(type(options)).items():
-        value = values[field.name]
-        items = value if isinstance(value, tuple) else (value,)
-        if (flag := flag_of(name, field))[0] != "-":
-            operands += [str(item) for item in items if item is not None]
-        elif value != default_of(field):
-            flags += [flag if item is True else f"{flag}={item}" for item in items]
-    return [*flags, "--", *operands]
 
 
 def in_page_words(text: str, command: Command | None = None) -> str:

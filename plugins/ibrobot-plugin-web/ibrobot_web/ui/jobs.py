@@ -8,14 +8,14 @@ from typing import Any
 
 import attrs
 from ibrobot_provenance.asking import Answer, Ask
+from ibrobot_provenance.processes import Reader, arguments
 
 from ibrobot_core.api import IbrobotError, option
 from ibrobot_core.app import Command, Failed, WireError, decode_event, installed_plugins
 from ibrobot_web.pictures import Picture
 from ibrobot_web.ui.context import Routes, Ui
 from ibrobot_web.ui.folders import Folders
-from ibrobot_web.ui.forms import arguments, form_of, in_page_words, job_commands, read_form, title_of
-from ibrobot_web.ui.job_runner import Reader
+from ibrobot_web.ui.forms import form_of, in_page_words, job_commands, read_form, title_of
 
 _POINTS = 400
 """Points of a curve that are kept."""

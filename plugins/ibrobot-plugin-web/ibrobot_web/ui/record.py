@@ -8,10 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ibrobot_provenance.processes import arguments
+
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import installed_plugins
 from ibrobot_web.ui.context import Routes, Ui
-from ibrobot_web.ui.forms import arguments, read_form
+from ibrobot_web.ui.forms import read_form
 from ibrobot_web.ui.jobs import event_reader
 from ibrobot_web.ui.robots import RUN_DONE, read_address, run_arguments
 

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import attrs
-from ibrobot_provenance.asking import Answer
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_web.status import without_tokens
+from ibrobot_core.app import default_of, fields, flag_of
+from ibrobot_provenance.asking import Answer
 
 IBROBOT = (sys.executable, "-c", "from ibrobot_core.cli.command import main; main()")
 """The command `ibrobot` of this environment, whatever PATH says."""
@@ -29,7 +29,7 @@ LINES = 2000
 _ENDED = 50
 """Ended jobs that are kept."""
 _END_S = 20.0
-"""Time that jobs get to end by themselves when the page's server ends [s]."""
+"""Time that jobs get to end by themselves when what runs them ends [s]."""
 _POLL_S = 0.5
 """Period of checking whether a silent job has ended [s]."""
 _CHUNK = 65536
@@ -88,10 +88,11 @@ class Jobs:
 
     Args:
         folder: the working directory of jobs.
+        clean: what is kept of a line of output.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, clean: Callable[[str], str] = lambda line: line) -> None:
+        self._folder, self._clean = folder, clean
         self._jobs: dict[int, Job] = {}
         self._threads: list[threading.Thread] = []
         self._lock = threading.Lock()
@@ -121,7 +122,7 @@ class Jobs:
         """
         with self._lock:
             if self._closed:
-                raise IbrobotError("the page's server is ending")
+                raise IbrobotError("no job can be started any more: what runs them is ending")
             try:
                 process = subprocess.Popen(
                     [*program, *arguments], cwd=self._folder, stdin=subprocess.PIPE if asks else subprocess.DEVNULL,
@@ -243,7 +244,7 @@ class Jobs:
                 event = read(text) if read is not None else None
                 job.facts.update(event or {})
                 if event is None or not text.startswith("{"):
-                    job.lines.append(without_tokens(text[:_LONGEST]))
+                    job.lines.append(self._clean(text[:_LONGEST]))
                     job.count += 1
         if lines:
             self._change(job)
@@ -260,6 +261,21 @@ class Jobs:
         ended = [number for number, job in self._jobs.items() if job.state != "running"]
         for number in ended[: max(0, len(ended) - _ENDED)]:
             del self._jobs[number]
+
+
+def arguments(options: Any) -> list[str]:
+    """The arguments of a command line that give these options."""
+    flags: list[str] = []
+    operands: list[str] = []
+    values = attrs.asdict(options, recurse=False)
+    for name, field in fields(type(options)).items():
+        value = values[field.name]
+        items = value if isinstance(value, tuple) else (value,)
+        if (flag := flag_of(name, field))[0] != "-":
+            operands += [str(item) for item in items if item is not None]
+        elif value != default_of(field):
+            flags += [flag if item is True else f"{flag}={item}" for item in items]
+    return [*flags, "--", *operands]
 
 
 def _read(process: subprocess.Popen[bytes], output: int) -> bytes:

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from ibrobot_kinematics.poses import matrix
-from ibrobot_kinematics.urdf import read_urdf
 
 from ibrobot_core.api import Pose, TFMessage, TransformStamped, Vector, ns, seconds
 from ibrobot_core.app import Received, RunView
-from ibrobot_planning.world.ages import Unusable
-from ibrobot_planning.world.objects import BASE_FRAMES
-from ibrobot_planning.world.options import FURTHEST
+from ibrobot_kinematics.poses import matrix
+from ibrobot_kinematics.urdf import read_urdf
 
+BASE_FRAMES = ("", "base", "base_link")
+"""Names of the base frame beside that of the root of the URDF."""
+_FURTHEST = 1000.0
+"""Greatest coordinate of a frame [m]."""
 _NEARLY_ONE = 1e-3
 """Allowed deviation of a quaternion's length from 1."""
 _MOST_FRAMES, _MOST_TIMES = 1000, 500
@@ -21,6 +22,10 @@ _MOST_FRAMES, _MOST_TIMES = 1000, 500
 _MOST_NAMED = 20
 _QUEUE = 200
 """Messages that may wait for the next update."""
+
+
+class UnknownFrame(ValueError):
+    """A frame whose pose in the base frame is not known."""
 
 
 class Frames:
@@ -72,7 +77,7 @@ class Frames:
             tolerance_s: greatest difference between that and the time of a transform on `/tf` [s].
 
         Raises:
-            Unusable: for a frame that is unknown, not connected to the base, or not known at that time.
+            UnknownFrame: for a frame that is unknown, not connected to the base, or not known at that time.
         """
         self.update()
         root, placed = self._in_root(frame, at_ns, tolerance_s)
@@ -92,7 +97,7 @@ class Frames:
             placed = matrix(Pose(transform.translation, transform.rotation)) @ placed
             here = transform.header.frame_id
             if here in passed:
-                raise Unusable("unknown frame", f"the transforms of frame {frame!r} run in a circle by way of {here!r}")
+                raise UnknownFrame(f"the transforms of frame {frame!r} run in a circle by way of {here!r}")
             passed.add(here)
         return here, placed
 
@@ -101,8 +106,7 @@ class Frames:
             return self._fixed[frame]
         then_ns, nearest = min(self._moving[frame], key=lambda each: abs(each[0] - at_ns))
         if abs(then_ns - at_ns) > ns(tolerance_s):
-            raise Unusable(
-                "unknown frame",
+            raise UnknownFrame(
                 f"the nearest transform of frame {frame!r} on /tf is {seconds(abs(then_ns - at_ns)):.1f} s from the"
                 f" time of the message, at most {tolerance_s:g} s is allowed (transform_tolerance)",
             )
@@ -127,7 +131,7 @@ class Frames:
                 usable.append(each)
         return usable
 
-    def _no_transform(self, frame: str, root: str) -> Unusable:
+    def _no_transform(self, frame: str, root: str) -> UnknownFrame:
         names = sorted(self._known())
         known = ", ".join(names[:_MOST_NAMED]) + (
             f" and {len(names) - _MOST_NAMED} more" if names[_MOST_NAMED:] else ""
@@ -138,8 +142,7 @@ class Frames:
             why = f"its tree ends at {root!r}, which is not the base ({', '.join(sorted(self._bases))})"
         else:
             why = f"known frames: {known or 'none'}"
-        return Unusable(
-            "unknown frame",
+        return UnknownFrame(
             f"no transform of frame {frame!r} to the base; peripherals[].transform says where a camera is mounted;"
             f" {why}",
         )
@@ -148,7 +151,7 @@ class Frames:
 def _fault(transform: TransformStamped) -> str:
     """What is wrong with a transform; empty if it is a pose."""
     t, q = transform.translation, transform.rotation
-    if not (np.abs([t.x, t.y, t.z]) <= FURTHEST).all():  # so that NaN fails it, as below
+    if not (np.abs([t.x, t.y, t.z]) <= _FURTHEST).all():  # so that NaN fails it, as below
         return f"its translation is ({t.x:g}, {t.y:g}, {t.z:g}) m"
     length = float(np.linalg.norm([q.x, q.y, q.z, q.w]))
     return "" if abs(length - 1) <= _NEARLY_ONE else f"its quaternion has length {length:.3g}, must have 1"
