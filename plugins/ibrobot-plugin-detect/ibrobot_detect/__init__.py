@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
-from ibrobot_core.api import Late, hookimpl
+from ibrobot_core.api import Descriptor, Late, hookimpl
 from ibrobot_core.app import Kind, SectionDescriptor
 from ibrobot_detect.detector import KIND, DetectorDescriptor
 from ibrobot_detect.options import SECTION, DetectOptions, SceneOptions, TagOptions
@@ -14,6 +15,12 @@ from ibrobot_detect.options import SECTION, DetectOptions, SceneOptions, TagOpti
 def ibrobot_kinds() -> Iterable[Kind]:
     """Detectors."""
     yield Kind(KIND, "ibrobot_detectors", DetectorDescriptor)
+
+
+@hookimpl(optionalhook=True)
+def ibrobot_samples() -> Iterable[Descriptor[Any]]:
+    """What `ibrobot plugins new` begins with."""
+    yield Descriptor(KIND, Late("ibrobot_detect.fakes:FakeDetector"), "things of two colours on a table")
 
 
 @hookimpl

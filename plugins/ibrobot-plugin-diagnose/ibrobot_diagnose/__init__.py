@@ -11,7 +11,7 @@ from typing import Any
 
 import attrs
 from ibrobot_provenance.reports import ReportDescriptor
-from ibrobot_provenance.work import WorkDescriptor, Workplace, some_options
+from ibrobot_provenance.work import Work, Workplace, some_options
 
 from ibrobot_core.api import Descriptor, Late, hookimpl
 from ibrobot_core.app import Command, Kind, SectionDescriptor
@@ -80,6 +80,14 @@ def _is_check(folder: Path) -> bool:
     return (folder / CHECK).is_file()
 
 
+def _explained(wanted: Any, place: Workplace) -> ExplainOptions:
+    return ExplainOptions(jobs=1, out=place.out, **attrs.asdict(wanted, recurse=False))
+
+
+def _checked(wanted: Any, place: Workplace) -> CheckOptions:
+    return CheckOptions(jobs=1, out=place.out, **attrs.asdict(wanted, recurse=False))
+
+
 @hookimpl
 def ibrobot_reports() -> Iterable[ReportDescriptor]:
     """Explanations, and checks of datasets."""
@@ -92,6 +100,13 @@ def ibrobot_reports() -> Iterable[ReportDescriptor]:
         reads=_is_explanation,
         lines=Late(f"{contents}:lines_of"),
         make=Late(f"{contents}:read_contents"),
+        work=Work(
+            "explain",
+            "Say why a recorded run of a policy failed.",
+            "explain",
+            some_options(ExplainOptions, "episodes", "data", "against"),
+            _explained,
+        ),
     )
     checks = "ibrobot_diagnose.check_contents"
     yield ReportDescriptor(
@@ -102,31 +117,11 @@ def ibrobot_reports() -> Iterable[ReportDescriptor]:
         reads=_is_check,
         lines=Late(f"{checks}:lines_of"),
         make=Late(f"{checks}:read_contents"),
-    )
-
-
-def _explained(wanted: Any, place: Workplace) -> ExplainOptions:
-    return ExplainOptions(jobs=1, out=place.out, **attrs.asdict(wanted, recurse=False))
-
-
-def _checked(wanted: Any, place: Workplace) -> CheckOptions:
-    return CheckOptions(jobs=1, out=place.out, **attrs.asdict(wanted, recurse=False))
-
-
-@hookimpl
-def ibrobot_work() -> Iterable[WorkDescriptor]:
-    """Explanations of recorded runs, and checks of datasets, for those who use a run."""
-    yield WorkDescriptor(
-        "explain",
-        summary="Say why a recorded run of a policy failed.",
-        command="explain",
-        options=some_options(ExplainOptions, "episodes", "data", "against"),
-        make=_explained,
-    )
-    yield WorkDescriptor(
-        "check_dataset",
-        summary="Say which episodes of a dataset to look at, and why.",
-        command="datasets check",
-        options=some_options(CheckOptions, "dataset", "least"),
-        make=_checked,
+        work=Work(
+            "check_dataset",
+            "Say which episodes of a dataset to look at, and why.",
+            "datasets check",
+            some_options(CheckOptions, "dataset", "least"),
+            _checked,
+        ),
     )

@@ -8,7 +8,7 @@ from typing import Any
 
 import attrs
 from ibrobot_provenance.reports import ReportDescriptor
-from ibrobot_provenance.work import WorkDescriptor, Workplace, some_options
+from ibrobot_provenance.work import Work, Workplace, some_options
 
 from ibrobot_core.api import Late, hookimpl
 from ibrobot_core.app import Command
@@ -27,6 +27,11 @@ def _is_evaluation(folder: Path) -> bool:
     return (folder / SETTINGS).is_file()
 
 
+def _in_simulation(wanted: Any, place: Workplace) -> EvalOptions:
+    stated = attrs.asdict(wanted, recurse=False)
+    return EvalOptions(config=(str(place.robot),), sim=True, jobs=1, videos=0, out=place.out, **stated)
+
+
 @hookimpl
 def ibrobot_reports() -> Iterable[ReportDescriptor]:
     """Evaluations."""
@@ -38,22 +43,12 @@ def ibrobot_reports() -> Iterable[ReportDescriptor]:
         reads=_is_evaluation,
         lines=Late("ibrobot_eval.contents:lines_of"),
         make=Late("ibrobot_eval.contents:read_contents"),
-    )
-
-
-def _in_simulation(wanted: Any, place: Workplace) -> EvalOptions:
-    stated = attrs.asdict(wanted, recurse=False)
-    return EvalOptions(config=(str(place.robot),), sim=True, jobs=1, videos=0, out=place.out, **stated)
-
-
-@hookimpl
-def ibrobot_work() -> Iterable[WorkDescriptor]:
-    """Evaluations of the robot's policies, in simulation."""
-    yield WorkDescriptor(
-        "evaluate",
-        summary="Count the successes of the robot's policies in simulation; the robot itself does not move.",
-        command="eval",
-        options=some_options(EvalOptions, "mode", "model", "episodes", "seed", "margin"),
-        make=_in_simulation,
-        keeps="evaluations",
+        work=Work(
+            "evaluate",
+            "Count the successes of the robot's policies in simulation; the robot itself does not move.",
+            "eval",
+            some_options(EvalOptions, "mode", "model", "episodes", "seed", "margin"),
+            _in_simulation,
+            keeps="evaluations",
+        ),
     )

@@ -16,7 +16,7 @@ from typing import Any
 import attrs
 from ibrobot_provenance.processes import Job, Jobs, arguments
 from ibrobot_provenance.reports import Case, Cases, Plots, ReportSection, Table, Text, kinds_of_reports
-from ibrobot_provenance.work import WorkDescriptor, Workplace
+from ibrobot_provenance.work import Work, Workplace
 
 from ibrobot_core.api import IbrobotError, MissingDependency, option
 from ibrobot_core.app import (
@@ -133,11 +133,9 @@ class Places:
         raise RequestError(f"{self.results / kind} has {_MOST_RESULTS} results: a person must remove some")
 
 
-def kinds_of_work() -> list[WorkDescriptor]:
-    """The work that installed packages offer, whose command is installed."""
-    registry = installed_plugins()
-    known = (each for each in registry.of_kind("work") if isinstance(each, WorkDescriptor))
-    return [each for each in known if each.command in registry.commands]
+def kinds_of_work() -> list[Work]:
+    """The work that installed packages offer."""
+    return [each.work for each in kinds_of_reports().values() if each.work is not None]
 
 
 class WorkServices:
@@ -168,35 +166,35 @@ class WorkServices:
         self._jobs.close()
         shutil.rmtree(self._scratch, ignore_errors=True)
 
-    def _serve(self, work: WorkDescriptor) -> None:
+    def _serve(self, work: Work) -> None:
         command = installed_plugins().command(work.command)
-        name, what = f"/{work.type}", work.command
+        name, what = f"/{work.name}", work.command
         progress = Service(f"{name}/progress", NoRequest, WorkProgress, f"How far `{what}` is.", reads=True)
         result = Service(
             f"{name}/result", Numbered, WorkResult | NoneType, f"What `{what}` has found.", "number", reads=True
         )
         cancel = Service(f"{name}/cancel", NoRequest, NoneType, f"End `{what}` early.", urgent=True)
         start = Service(
-            name, work.options, int, work.summary, reads=not work.keeps, progress=progress, result=result, cancel=cancel
+            name, work.options, int, work.help, reads=not work.keeps, progress=progress, result=result, cancel=cancel
         )
         handlers: Mapping[Service[Any, Any], Callable[[Any], Any]] = {
             start: partial(self._start, work, command),
-            progress: lambda _: self._progress(work.type),
-            result: lambda request: self._result(work.type, request.number),
-            cancel: lambda _: self._cancel(work.type),
+            progress: lambda _: self._progress(work.name),
+            result: lambda request: self._result(work.name, request.number),
+            cancel: lambda _: self._cancel(work.name),
         }
         for service, handler in handlers.items():
             self._session.bus.serve(service, handler, self._places.find)
             self._served.append(service)
 
-    def _start(self, work: WorkDescriptor, command: Command, request: Any) -> int:
+    def _start(self, work: Work, command: Command, request: Any) -> int:
         with self._lock:
             if (running := self._running()) is not None:
-                raise RequestError(f"/{work.type}: {running.kind} works already, see /{running.kind}/progress")
+                raise RequestError(f"/{work.name}: {running.kind} works already, see /{running.kind}/progress")
             try:
                 command.check()
             except MissingDependency as error:
-                raise RequestError(f"/{work.type}: {error}") from error
+                raise RequestError(f"/{work.name}: {error}") from error
             robot = self._scratch / f"{self._session.config.robot.name}.yaml"
             document = {key: value for key, value in self._session.config.document.items() if key != SECTION}
             robot.write_text(dump_yaml(document), encoding="utf-8")
@@ -206,10 +204,10 @@ class WorkServices:
             try:
                 options = work.make(request, Workplace(robot, out))
             except ValueError as error:
-                raise RequestError(f"/{work.type}: {error}") from error
+                raise RequestError(f"/{work.name}: {error}") from error
             words = [*work.command.split(), "--events", *arguments(options)]
             job = self._jobs.start(
-                work.type, work.summary, words, read=partial(_facts, command), program=_IDLE, done_codes=(0,)
+                work.name, work.help, words, read=partial(_facts, command), program=_IDLE, done_codes=(0,)
             )
             job.facts["out"] = str(out) if work.keeps else ""
             return job.number

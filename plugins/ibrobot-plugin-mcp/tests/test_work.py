@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from ibrobot_mcp import work
 from ibrobot_mcp.work import Places, WorkResult, WorkServices, report_lines
 from ibrobot_provenance.reports import Case, Cases, Plots, ReportDescriptor, ReportSection, Table, Text
-from ibrobot_provenance.work import WorkDescriptor, Workplace, some_options
+from ibrobot_provenance.work import Work, Workplace, some_options
 from ibrobot_testing import make_session
 
 from ibrobot_core.api import IbrobotError, Options, option
@@ -81,15 +81,10 @@ class Rig:
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, keeps: str, program: str) -> None:
         options = some_options(Look, "things", "count")
-        offered = WorkDescriptor(
-            "stare", summary="Look at things.", command="look", options=options, make=_made, keeps=keeps
-        )
-        registry = Registry(
-            entries={("work", "stare"): cast("Any", SimpleNamespace(descriptor=offered))},
-            commands={"look": Command("look", Look, "Look.", (Looked,))},
-        )
+        offered = attrs.evolve(REPORT, work=Work("stare", "Look at things.", "look", options, _made, keeps))
+        registry = Registry(commands={"look": Command("look", Look, "Look.", (Looked,))})
         monkeypatch.setattr(work, "installed_plugins", lambda: registry)
-        monkeypatch.setattr(work, "kinds_of_reports", lambda: {"looks": REPORT})
+        monkeypatch.setattr(work, "kinds_of_reports", lambda: {"looks": offered})
         monkeypatch.setattr(work, "states_folder", lambda: folder / "states")
         monkeypatch.setattr(work, "_IDLE", (sys.executable, "-c", program))
         self.session: Session = make_session()

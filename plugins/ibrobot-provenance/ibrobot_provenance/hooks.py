@@ -1,4 +1,4 @@
-"""The hooks of the package: the kinds of pools, of reports, of dataset writers, and of work that runs offer."""
+"""The hooks of the package: the kinds of pools, of reports and of dataset writers."""
 
 from __future__ import annotations
 
@@ -10,16 +10,14 @@ from ibrobot_core.app import Kind
 from ibrobot_provenance.datasets import DatasetDescriptor
 from ibrobot_provenance.jobs import PoolDescriptor
 from ibrobot_provenance.reports import ReportDescriptor
-from ibrobot_provenance.work import WorkDescriptor
 
 
 @hookimpl
 def ibrobot_kinds() -> Iterable[Kind]:
-    """Pools, where jobs run, reports on folders with results, dataset writers, and work that runs offer."""
+    """Pools, where jobs run, reports on folders with results, and dataset writers."""
     yield Kind("pool", "ibrobot_pools", PoolDescriptor)
     yield Kind("dataset", "ibrobot_datasets", DatasetDescriptor)
     yield Kind("report", "ibrobot_reports", ReportDescriptor)
-    yield Kind("work", "ibrobot_work", WorkDescriptor)
 
 
 @hookimpl(optionalhook=True)

@@ -10,6 +10,7 @@ import attrs
 
 from ibrobot_core.api import Descriptor
 from ibrobot_core.app import installed_plugins
+from ibrobot_provenance.work import Work
 
 PLOT_CLASSES = (
     "ok", "bad", "bad-fill", "faint", "range", "band", "estimate", "grid", "zero", "margin", "label",
@@ -98,6 +99,8 @@ class ReportDescriptor(Descriptor[Any]):
     """Returns the result of a folder in a few lines; raises IbrobotError."""
     command: str = attrs.field(default="", kw_only=True)
     """The command that writes such folders, e.g. `eval`; on pages its view leads to the reports."""
+    work: Work | None = attrs.field(default=None, kw_only=True)
+    """How those who use a run have one made, e.g. agents; None if they cannot."""
 
 
 def kinds_of_reports() -> dict[str, ReportDescriptor]:

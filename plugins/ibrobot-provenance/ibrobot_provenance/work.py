@@ -8,7 +8,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.api import Descriptor, Options
+from ibrobot_core.api import Options
 from ibrobot_core.app import fields
 
 
@@ -23,18 +23,24 @@ class Workplace:
 
 
 @attrs.frozen
-class WorkDescriptor(Descriptor[Any]):
-    """Work, by its `type` as the service is called, e.g. `evaluate`. `options` are what its callers may state.
+class Work:
+    """Work that makes a report, for those who use a run, e.g. agents.
 
     Callers may be programs that nobody trusts. So the options have no address, no command, and no file but as a `Path`,
     which the run confines to its recordings and results.
     """
 
-    make: Callable[[Any, Workplace], Any] = attrs.field(kw_only=True)  # type: ignore[assignment]
-    """What callers state, and the place -> the options of the command."""
-    command: str = attrs.field(kw_only=True)
+    name: str
+    """As the service is called, e.g. `evaluate`."""
+    help: str
+    """One sentence that says what it does."""
+    command: str
     """The command that does it; its events say how far it is, and what it has made."""
-    keeps: str = attrs.field(default="", kw_only=True)
+    options: type[Any]
+    """The class of what callers may state."""
+    make: Callable[[Any, Workplace], Any]
+    """What callers state, and the place -> the options of the command."""
+    keeps: str = ""
     """The folder in which its results are kept, e.g. `evaluations`. Without one they are only shown to the caller, so
     that anybody may ask for them."""
 
