@@ -38,9 +38,9 @@ def _on_table(name: str, sight: Sight, share: float) -> Detection | None:
     picture = sight.pixels.astype(float)
     light = picture.sum(axis=2)
     mask = (light > 60) & (picture[..., _COLOURS[name]] > share * light)
-    if mask.mean() < 1e-4 or mask.mean() > 0.2:
-        return None
     y, x = np.nonzero(mask)
+    if len(x) < 10 or len(x) < 0.5 * (np.ptp(x) + 1) * (np.ptp(y) + 1):  # nothing, or no thing of its own
+        return None
     ray = sight.pose[:3, :3] @ np.linalg.solve(sight.intrinsics, [x.mean(), y.mean(), 1.0])
     if ray[2] >= 0:
         return None
