@@ -27,8 +27,8 @@ class FakeDetector(Detector):
     @override
     def find(self, name: str, sights: Sequence[Sight]) -> Sequence[Detection]:
         wanted = fits(name, list(_COLOURS)) if name else list(_COLOURS)
-        found = [_on_table(each, sight, self._share) for each in wanted for sight in sights]
-        best = {each.name: each for each in sorted(filter(None, found), key=lambda each: each.score)}
+        seen = [_on_table(each, sight, self._share) for each in wanted for sight in sights]
+        best = {each.name: each for each in sorted(filter(None, seen), key=lambda each: each.score)}
         return sorted(best.values(), key=lambda each: -each.score)
 
 

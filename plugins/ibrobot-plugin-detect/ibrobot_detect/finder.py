@@ -94,14 +94,14 @@ class Finder(Component):
         if wanted.camera and wanted.camera in without:
             raise SensorError(f"camera {wanted.camera}: {without[wanted.camera]}")
         with self._lock:
-            found = [
+            objects = [
                 _found(type_, each)
                 for type_, (detector, pictures) in self._detectors.items()
                 for each in detector.find(wanted.name, [s for s in sights if not pictures or s.pixels is not None])
             ]
         if wanted.at:
-            found = _at(found, wanted.camera, wanted.at)
-        return Found(tuple(found), without)
+            objects = _at(objects, wanted.camera, wanted.at)
+        return Found(tuple(objects), without)
 
     def _sights(
         self, topics: Mapping[str, str], taken: Mapping[str, Message], frames: Frames, timeout_s: float
@@ -175,7 +175,7 @@ def _found(detector: str, each: Detection) -> FoundObject:
     return FoundObject(each.name, detector, position, quaternion, size, each.score, each.seen)
 
 
-def _at(found: Sequence[FoundObject], camera: str, place: Sequence[float]) -> list[FoundObject]:
+def _at(objects: Sequence[FoundObject], camera: str, place: Sequence[float]) -> list[FoundObject]:
     """The objects that a camera sees at a place, the one that fills least of the picture first."""
 
     def areas(each: FoundObject) -> Iterator[float]:
@@ -184,5 +184,5 @@ def _at(found: Sequence[FoundObject], camera: str, place: Sequence[float]) -> li
             if seen.camera == camera and left <= place[0] <= right and top <= place[1] <= bottom:
                 yield (right - left) * (bottom - top)
 
-    there = [(min(areas(each)), each) for each in found if any(True for _ in areas(each))]
+    there = [(min(areas(each)), each) for each in objects if any(True for _ in areas(each))]
     return [each for _, each in sorted(there, key=lambda pair: pair[0])]

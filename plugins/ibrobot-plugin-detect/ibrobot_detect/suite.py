@@ -39,9 +39,9 @@ class DetectorSuite(Suite[Detector]):
 
     def test_finds_each_object_where_it_is(self) -> None:
         """Without a name, it finds all objects, each once, at its pose."""
-        found = self._found("", self.sights())
-        assert sorted(each.name for each in found) == sorted(self.objects())
-        for each in found:
+        detections = self._found("", self.sights())
+        assert sorted(each.name for each in detections) == sorted(self.objects())
+        for each in detections:
             truth, there = matrix(self.objects()[each.name]), matrix(each.pose)
             away_m = float(np.linalg.norm(truth[:3, 3] - there[:3, 3]))
             assert away_m <= self.tolerance_m, f"{each.name} is found {away_m * 1000:.1f} mm from where it is"

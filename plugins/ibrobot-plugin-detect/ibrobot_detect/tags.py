@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, override
 
 import numpy as np
@@ -21,6 +23,19 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 """The frame of the options, y up and z out of the tag, in that of the library, y down and z into it."""
 
 
+class _Library(Apriltags):
+    """The library for one family of tags, which the process keeps: its own end frees memory that it then reads."""
+
+    def __del__(self) -> None:
+        """Free nothing."""
+
+
+@cache
+def _library(family: str) -> tuple[_Library, threading.Lock]:
+    """The library for a family, and what is held while it is used."""
+    return _Library(family, quad_decimate=1.0), threading.Lock()
+
+
 class TagDetector(Detector):
     """Finds objects by their tags, in the camera that sees the tag with the greatest contrast.
 
@@ -34,7 +49,7 @@ class TagDetector(Detector):
     def __init__(self, options: TagOptions, run: RunView) -> None:
         self._options = options
         self._objects = {each.id: (name, each) for name, each in options.tags.items()}
-        self._library = Apriltags(options.family, quad_decimate=1.0)
+        self._library, self._lock = _library(options.family)
         self._maps: dict[str, tuple[Any, Vector, NDArray[np.bool_]]] = {}
         """Camera -> what its map depends on, the place of each straight pixel, and whether that is in the picture."""
 
@@ -48,12 +63,12 @@ class TagDetector(Detector):
             )
         best: dict[str, tuple[float, Detection]] = {}
         for sight in sights if wanted else ():
-            for found in self._tags(sight):
-                name_of, tag = self._objects[found.tag_id]
-                margin = float(found.decision_margin)
+            for tag_seen in self._tags(sight):
+                name_of, tag = self._objects[tag_seen.tag_id]
+                margin = float(tag_seen.decision_margin)
                 if name_of not in wanted or margin < self._options.margin:
                     continue
-                detection = _placed(sight, name_of, tag, found)
+                detection = _placed(sight, name_of, tag, tag_seen)
                 seen = best[name_of][1].seen if name_of in best else ()
                 if name_of not in best or margin > best[name_of][0]:
                     best[name_of] = margin, detection
@@ -67,12 +82,13 @@ class TagDetector(Detector):
         grey = np.ascontiguousarray(self._straight(sight) @ np.array([0.299, 0.587, 0.114]) + 0.5, dtype=np.uint8)
         k = sight.intrinsics
         centre = (k[0, 2] + 0.5, k[1, 2] + 0.5)  # the library's first pixel reaches from 0 to 1
-        found: list[Any] = []
+        known: list[Any] = []
         for size in sorted({each.size for _, each in self._objects.values()}):
-            tags = self._library.detect(grey, True, (k[0, 0], k[1, 1], *centre), size)
+            with self._lock:
+                tags = self._library.detect(grey, True, (k[0, 0], k[1, 1], *centre), size)
             of_size = {number for number, (_, each) in self._objects.items() if each.size == size}
-            found += [each for each in tags if each.tag_id in of_size]
-        return found
+            known += [each for each in tags if each.tag_id in of_size]
+        return known
 
     def _straight(self, sight: Sight) -> Vector:
         """The picture as a pinhole with the same matrix would take it, shape (height, width, 3)."""
@@ -104,16 +120,16 @@ def _sampled(picture: Vector, places: Vector, inside: NDArray[np.bool_]) -> Vect
     return np.asarray(np.where(inside[:, None], upper * (1 - down) + lower * down, 0.0).reshape(picture.shape))
 
 
-def _placed(sight: Sight, name: str, tag: Tag, found: Any) -> Detection:
+def _placed(sight: Sight, name: str, tag: Tag, tag_seen: Any) -> Detection:
     """The object of a tag that a camera sees."""
-    of_tag = homogeneous(found.pose_R @ _FLIP, found.pose_t[:, 0])
+    of_tag = homogeneous(tag_seen.pose_R @ _FLIP, tag_seen.pose_t[:, 0])
     placed = pose(sight.pose @ of_tag @ matrix(pose_at(tag.xyz, tag.rpy)))
     if len(tag.object_size) == 3:
         seen = box_of(sight, placed, [each / 2 for each in tag.object_size])
     else:
-        (left, top), (right, bottom) = found.corners.min(axis=0) - 0.5, found.corners.max(axis=0) - 0.5
+        (left, top), (right, bottom) = tag_seen.corners.min(axis=0) - 0.5, tag_seen.corners.max(axis=0) - 0.5
         seen = Seen(sight.camera, (round(left, 1), round(top, 1), round(right, 1), round(bottom, 1)))
-    score = min(1.0, float(found.decision_margin) / _SURE)
+    score = min(1.0, float(tag_seen.decision_margin) / _SURE)
     return Detection(name, placed, tag.object_size, round(score, 3), () if seen is None else (seen,))
 
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping
 from functools import cache
-from typing import Any
 
 import attrs
 import numpy as np
 from ibrobot_detect.detector import Sight
+from ibrobot_detect.tags import _library
 from ibrobot_kinematics.poses import homogeneous
 from ibrobot_kinematics.rotations import from_rpy
 from numpy.typing import NDArray
-from pupil_apriltags import Detector as Apriltags
 from pupil_apriltags.bindings import _ApriltagFamily
 
 FOCAL, WIDTH, HEIGHT = 600.0, 640, 480
@@ -27,7 +26,7 @@ _GREY = 120.0
 @cache
 def tag_cells(number: int) -> NDArray[np.uint8]:
     """The cells of a tag, shape (10, 10), by the code that the library knows."""
-    library: Any = Apriltags("tag36h11")
+    library, _ = _library("tag36h11")
     family = ctypes.cast(library.tag_families["tag36h11"], ctypes.POINTER(_ApriltagFamily)).contents
     cells = np.full((_CELLS, _CELLS), 255, np.uint8)
     cells[_BORDER:-_BORDER, _BORDER:-_BORDER] = 0

@@ -85,11 +85,11 @@ def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
 
 def test_objects_come_with_poses_and_places_in_pictures(rig: Rig) -> None:
     rig.camera("top")
-    found: Found = rig.session.bus.call("/find", "cup")
-    assert [(each.name, each.detector, each.position_m, each.score) for each in found.objects] == [
+    answer: Found = rig.session.bus.call("/find", "cup")
+    assert [(each.name, each.detector, each.position_m, each.score) for each in answer.objects] == [
         ("cup", "looker", (0.1, 0.2, 0.3), 0.5)
     ]
-    assert found.objects[0].seen == (Seen("top", (2.0, 1.0, 4.0, 3.0)),)
+    assert answer.objects[0].seen == (Seen("top", (2.0, 1.0, 4.0, 3.0)),)
     ((name, sights),) = rig.looker.asked
     assert (name, sights[0].camera, sights[0].size) == ("cup", "top", SIZE)
     assert sights[0].pose[:3, 3].tolist() == [0.0, 0.0, 1.0]
@@ -101,8 +101,8 @@ def test_objects_come_with_poses_and_places_in_pictures(rig: Rig) -> None:
 )
 def test_a_place_in_a_picture_chooses_what_is_seen_there(rig: Rig, at: tuple[float, float], names: list[str]) -> None:
     rig.camera("top")
-    found: Found = rig.session.bus.call("/find", {"camera": "top", "at": list(at)})
-    assert [each.name for each in found.objects] == names
+    answer: Found = rig.session.bus.call("/find", {"camera": "top", "at": list(at)})
+    assert [each.name for each in answer.objects] == names
 
 
 @pytest.mark.parametrize(
@@ -119,9 +119,9 @@ def test_a_place_in_a_picture_chooses_what_is_seen_there(rig: Rig, at: tuple[flo
 def test_cameras_that_cannot_be_used_are_named_with_the_reason(rig: Rig, camera: Any, why: str) -> None:
     rig.camera("top")
     rig.camera("side", **camera)
-    found: Found = rig.session.bus.call("/find", None)
-    assert list(found.without) == ["side"]
-    assert found.without["side"].startswith(why)
+    answer: Found = rig.session.bus.call("/find", None)
+    assert list(answer.without) == ["side"]
+    assert answer.without["side"].startswith(why)
     assert [each.camera for each in rig.looker.asked[0][1]] == ["top"]
     with pytest.raises(Exception, match="camera side: "):
         rig.session.bus.call("/find", {"camera": "side"})

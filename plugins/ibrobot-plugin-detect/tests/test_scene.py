@@ -55,9 +55,9 @@ class TestSceneDetector(DetectorSuite):
 
 def test_what_is_outside_of_the_picture_is_found_but_not_seen() -> None:
     away = SceneObject("post", "capsule", (0.02, 0.5), pose_at((3.0, 0.0, 0.3)))
-    found = SceneDetector(SceneOptions(), run_with([*THINGS, away])).find("post", [camera(ABOVE)])
-    assert [(each.name, each.seen) for each in found] == [("post", ())]
-    assert found[0].size_m == pytest.approx((0.04, 0.04, 0.54))
+    detections = SceneDetector(SceneOptions(), run_with([*THINGS, away])).find("post", [camera(ABOVE)])
+    assert [(each.name, each.seen) for each in detections] == [("post", ())]
+    assert detections[0].size_m == pytest.approx((0.04, 0.04, 0.54))
 
 
 def test_what_is_behind_the_camera_is_not_seen() -> None:

@@ -66,9 +66,9 @@ def errors(distortion: NDArray[np.float64] | None, count: int) -> NDArray[np.flo
         far = rng.uniform(0.2, 0.7)
         place = (far * rng.uniform(-0.3, 0.3), far * rng.uniform(-0.2, 0.2), far)
         truth = facing(*rng.uniform(-0.9, 0.9, 2), rng.uniform(-np.pi, np.pi), place)
-        found = looked.find("", [photograph(camera(np.eye(4), distortion), {3: (truth, 0.04)})])
-        assert len(found) == 1, f"the tag at {place} is not found"
-        there = matrix(found[0].pose)
+        detections = looked.find("", [photograph(camera(np.eye(4), distortion), {3: (truth, 0.04)})])
+        assert len(detections) == 1, f"the tag at {place} is not found"
+        there = matrix(detections[0].pose)
         away = (there[:3, 3] - truth[:3, 3]) * 1000
         turned = np.degrees(np.arccos(np.clip(there[:3, 2] @ truth[:3, 2], -1, 1)))
         rows.append([np.hypot(*away[:2]), abs(away[2]), turned])
@@ -86,9 +86,9 @@ def test_pose_of_a_tag_is_exact_to_millimetres(distortion: NDArray[np.float64] |
 def test_half_a_pixel_is_no_matter_of_taste() -> None:
     """A tag that is seen head on, at the camera's axis, is found there: both count pixels from the same place."""
     truth = facing(0, 0, 0, (0.0, 0.0, 0.4))
-    found = detector({"cube": Tag(id=3, size=0.08)}).find("", [photograph(camera(np.eye(4)), {3: (truth, 0.08)})])
+    detections = detector({"cube": Tag(id=3, size=0.08)}).find("", [photograph(camera(np.eye(4)), {3: (truth, 0.08)})])
     pixel_m = 0.4 / FOCAL
-    assert np.abs(matrix(found[0].pose)[:2, 3]).max() < 0.25 * pixel_m
+    assert np.abs(matrix(detections[0].pose)[:2, 3]).max() < 0.25 * pixel_m
 
 
 def test_ignored_distortion_would_be_wrong() -> None:
@@ -108,9 +108,9 @@ def test_camera_with_the_best_view_says_where_a_tag_is() -> None:
     far_pose = homogeneous(np.eye(3), np.array([0.0, 0.0, -0.5]))
     far = photograph(camera(far_pose, name="far"), {3: (truth, 0.04)})
     for sights in ([near, far], [far, near]):
-        found = detector({"cube": Tag(id=3, size=0.04)}).find("cube", sights)
-        assert {each.camera for each in found[0].seen} == {"near", "far"}
-        assert np.linalg.norm(matrix(found[0].pose)[:3, 3] - truth[:3, 3]) < 0.0015
+        detections = detector({"cube": Tag(id=3, size=0.04)}).find("cube", sights)
+        assert {each.camera for each in detections[0].seen} == {"near", "far"}
+        assert np.linalg.norm(matrix(detections[0].pose)[:3, 3] - truth[:3, 3]) < 0.0015
 
 
 def test_tags_of_nothing_and_of_little_contrast_are_left_out() -> None:

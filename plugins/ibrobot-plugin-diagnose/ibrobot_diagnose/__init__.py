@@ -103,7 +103,6 @@ def ibrobot_reports() -> Iterable[ReportDescriptor]:
         work=Work(
             "explain",
             "Say why a recorded run of a policy failed.",
-            "explain",
             some_options(ExplainOptions, "episodes", "data", "against"),
             _explained,
         ),
@@ -120,7 +119,6 @@ def ibrobot_reports() -> Iterable[ReportDescriptor]:
         work=Work(
             "check_dataset",
             "Say which episodes of a dataset to look at, and why.",
-            "datasets check",
             some_options(CheckOptions, "dataset", "least"),
             _checked,
         ),

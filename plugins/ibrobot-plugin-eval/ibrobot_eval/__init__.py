@@ -46,7 +46,6 @@ def ibrobot_reports() -> Iterable[ReportDescriptor]:
         work=Work(
             "evaluate",
             "Count the successes of the robot's policies in simulation; the robot itself does not move.",
-            "eval",
             some_options(EvalOptions, "mode", "model", "episodes", "seed", "margin"),
             _in_simulation,
             keeps="evaluations",

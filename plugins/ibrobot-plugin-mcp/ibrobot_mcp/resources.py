@@ -120,8 +120,8 @@ class Resources:
     def _datasets(self) -> str:
         tops = [self._places.results, *([] if self._places.root is None else [self._places.root])]
         folders = [each for top in tops for where in (top, top / "datasets") for each in _folders(where)]
-        found = [each for each in dict.fromkeys(folders) if (each / _INFO).is_file() or (each / "episodes").is_dir()]
-        return json.dumps({"datasets": [_dataset(each) for each in found[-_MOST_FOLDERS:]]})
+        known = [each for each in dict.fromkeys(folders) if (each / _INFO).is_file() or (each / "episodes").is_dir()]
+        return json.dumps({"datasets": [_dataset(each) for each in known[-_MOST_FOLDERS:]]})
 
     def _kept(self) -> Iterator[tuple[Path, ReportDescriptor]]:
         """The results that are kept, each with what reads it."""
@@ -134,10 +134,10 @@ class Resources:
         rows: list[Mapping[str, Any]] = []
         for folder, kind in self._kept():
             try:
-                found: Mapping[str, Any] = {"lines": list(kind.lines(folder))}
+                facts: Mapping[str, Any] = {"lines": list(kind.lines(folder))}
             except (IbrobotError, OSError) as error:
-                found = {"unreadable": str(error)}
-            rows.append({"name": folder.name, "kind": kind.type, "path": str(folder), **found})
+                facts = {"unreadable": str(error)}
+            rows.append({"name": folder.name, "kind": kind.type, "path": str(folder), **facts})
         return json.dumps({"evaluations": rows})
 
     def _result(self, name: str) -> str:

@@ -118,7 +118,7 @@ class Places:
 
     def kept(self) -> list[Path]:
         """The folders of results that are kept, one for each kind of work."""
-        return [self.results / each for each in sorted({each.keeps for each in kinds_of_work()} - {""})]
+        return [self.results / each for each in sorted({work.keeps for work, _ in kinds_of_work()} - {""})]
 
     def new(self, kind: str) -> Path:
         """A folder for the next results of a kind, which is not there yet.
@@ -133,9 +133,9 @@ class Places:
         raise RequestError(f"{self.results / kind} has {_MOST_RESULTS} results: a person must remove some")
 
 
-def kinds_of_work() -> list[Work]:
-    """The work that installed packages offer."""
-    return [each.work for each in kinds_of_reports().values() if each.work is not None]
+def kinds_of_work() -> list[tuple[Work, str]]:
+    """The work that installed packages offer, each with its command."""
+    return [(each.work, each.command) for each in kinds_of_reports().values() if each.work is not None]
 
 
 class WorkServices:
@@ -156,8 +156,8 @@ class WorkServices:
         self._found: dict[int, WorkResult] = {}
         """Number -> the result of ended work."""
         self._served: list[Service[Any, Any]] = []
-        for each in kinds_of_work():
-            self._serve(each)
+        for work, command in kinds_of_work():
+            self._serve(work, installed_plugins().command(command))
 
     def close(self) -> None:
         """Serve no more, and end what runs. Safe to call twice."""
@@ -166,9 +166,8 @@ class WorkServices:
         self._jobs.close()
         shutil.rmtree(self._scratch, ignore_errors=True)
 
-    def _serve(self, work: Work) -> None:
-        command = installed_plugins().command(work.command)
-        name, what = f"/{work.name}", work.command
+    def _serve(self, work: Work, command: Command) -> None:
+        name, what = f"/{work.name}", command.name
         progress = Service(f"{name}/progress", NoRequest, WorkProgress, f"How far `{what}` is.", reads=True)
         result = Service(
             f"{name}/result", Numbered, WorkResult | NoneType, f"What `{what}` has found.", "number", reads=True
@@ -205,7 +204,7 @@ class WorkServices:
                 options = work.make(request, Workplace(robot, out))
             except ValueError as error:
                 raise RequestError(f"/{work.name}: {error}") from error
-            words = [*work.command.split(), "--events", *arguments(options)]
+            words = [*command.name.split(), "--events", *arguments(options)]
             job = self._jobs.start(
                 work.name, work.help, words, read=partial(_facts, command), program=_IDLE, done_codes=(0,)
             )

@@ -81,7 +81,7 @@ class Rig:
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, keeps: str, program: str) -> None:
         options = some_options(Look, "things", "count")
-        offered = attrs.evolve(REPORT, work=Work("stare", "Look at things.", "look", options, _made, keeps))
+        offered = attrs.evolve(REPORT, command="look", work=Work("stare", "Look at things.", options, _made, keeps))
         registry = Registry(commands={"look": Command("look", Look, "Look.", (Looked,))})
         monkeypatch.setattr(work, "installed_plugins", lambda: registry)
         monkeypatch.setattr(work, "kinds_of_reports", lambda: {"looks": offered})
@@ -94,9 +94,9 @@ class Rig:
     def ended(self) -> WorkResult:
         for thread in [each for each in threading.enumerate() if each.name.startswith("job ")]:
             thread.join(30)
-        found = self.call("/stare/result", 1)
-        assert isinstance(found, WorkResult)
-        return found
+        outcome = self.call("/stare/result", 1)
+        assert isinstance(outcome, WorkResult)
+        return outcome
 
 
 @pytest.fixture
@@ -115,13 +115,13 @@ def with_work(keeps: str, program: str) -> pytest.MarkDecorator:
 
 def test_a_result_has_the_report_and_nothing_is_kept(rig: Rig) -> None:
     assert rig.call("/stare", {"count": 5}) == 1
-    found = rig.ended()
-    assert (found.success, found.lines, found.folder) == (True, ("looked 2 times",), "")
-    assert found.report[0] == "# Looks"
-    assert "look --events --count=5 --out=" in found.report[1]
-    assert found.report[2:] == ("a | b", "1 | 2", "episode 3: it fell: ibrobot look 3")
+    outcome = rig.ended()
+    assert (outcome.success, outcome.lines, outcome.folder) == (True, ("looked 2 times",), "")
+    assert outcome.report[0] == "# Looks"
+    assert "look --events --count=5 --out=" in outcome.report[1]
+    assert outcome.report[2:] == ("a | b", "1 | 2", "episode 3: it fell: ibrobot look 3")
     assert not (rig.services._scratch / "results").exists()
-    assert rig.call("/stare/result", 1) == found, "it may be asked for again"
+    assert rig.call("/stare/result", 1) == outcome, "it may be asked for again"
 
 
 @with_work("looks", ENDS)
@@ -198,7 +198,7 @@ def places_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Places:
         (folder / name).mkdir(parents=True, exist_ok=True)
     (folder / "private" / "key").write_text("secret")
     (folder / "episodes" / "out").symlink_to(folder / "private")
-    monkeypatch.setattr(work, "kinds_of_work", lambda: [SimpleNamespace(keeps="evaluations")])
+    monkeypatch.setattr(work, "kinds_of_work", lambda: [(SimpleNamespace(keeps="evaluations"), "")])
     recording = SimpleNamespace(root=str(folder / "episodes"), dataset="pick")
     return Places(cast("RunView", SimpleNamespace(config=SimpleNamespace(recording=recording))))
 
@@ -243,11 +243,11 @@ def test_no_text_leads_out_of_the_folders(tmp_path: Path) -> None:
         def never_outside(words: list[str], absolute: bool) -> None:
             text = "/".join(words)
             try:
-                found = places.find(f"{tmp_path}/{text}" if absolute else text)
+                outcome = places.find(f"{tmp_path}/{text}" if absolute else text)
             except ValueError:
                 return
-            assert any(found.is_relative_to(tmp_path / top) for top in ("episodes", "evaluations"))
-            assert "private" not in found.parts[len(tmp_path.parts) :]
+            assert any(outcome.is_relative_to(tmp_path / top) for top in ("episodes", "evaluations"))
+            assert "private" not in outcome.parts[len(tmp_path.parts) :]
 
         never_outside()
 

@@ -1,4 +1,4 @@
-"""Work that a run offers as services, e.g. to agents: a command with events, and some of its options."""
+"""Work that a run offers as services, e.g. to agents: some of the options of a command."""
 
 from __future__ import annotations
 
@@ -34,12 +34,10 @@ class Work:
     """As the service is called, e.g. `evaluate`."""
     help: str
     """One sentence that says what it does."""
-    command: str
-    """The command that does it; its events say how far it is, and what it has made."""
     options: type[Any]
     """The class of what callers may state."""
     make: Callable[[Any, Workplace], Any]
-    """What callers state, and the place -> the options of the command."""
+    """What callers state, and the place -> the options of the command that writes such reports, which has events."""
     keeps: str = ""
     """The folder in which its results are kept, e.g. `evaluations`. Without one they are only shown to the caller, so
     that anybody may ask for them."""
