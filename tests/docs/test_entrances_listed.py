@@ -117,6 +117,7 @@ COMMANDS = {
     "eval": "engine monolithic",
     "replay": "ibrobot replay",
     "task": "/task/run",
+    "identify": "/task/run",  # `--excite`
     "mcp": "ibrobot mcp",
     "action": "FollowJointTrajectory",
     "service": "/planning/go_to",

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
+
+from ibrobot_provenance.reports import ReportDescriptor
 
 from ibrobot_core.api import (
     DecoderDescriptor,
@@ -18,6 +21,7 @@ from ibrobot_core.api import (
 from ibrobot_core.app import Command, Kind
 from ibrobot_mujoco.experts import EXPERTS
 from ibrobot_mujoco.gl import choose, from_module
+from ibrobot_mujoco.identification.options import EVENTS, KIND, REPORT
 from ibrobot_mujoco.options import CameraOptions, MujocoOptions
 from ibrobot_mujoco.scene import SceneDescriptor
 from ibrobot_mujoco.scenes import SCENES
@@ -81,9 +85,29 @@ def ibrobot_arm_views() -> Iterable[Descriptor[Any]]:
 
 @hookimpl
 def ibrobot_commands() -> Iterable[Command]:
-    """`ibrobot config new`."""
+    """`ibrobot config new` and `ibrobot identify`."""
+    identify = Late("ibrobot_mujoco.identification.command:Identify")
+    yield Command("identify", identify, "Find the parameters of a simulated arm from recordings.", EVENTS)
     summary = "Write a robot YAML for the arm in a URDF or MJCF."
     yield Command("config new", Late("ibrobot_mujoco.new_robot:NewRobot"), summary)
+
+
+def _is_identification(folder: Path) -> bool:
+    return (folder / REPORT).is_file()
+
+
+@hookimpl
+def ibrobot_reports() -> Iterable[ReportDescriptor]:
+    """Identifications of arms."""
+    contents = "ibrobot_mujoco.identification.contents"
+    yield ReportDescriptor(
+        KIND,
+        summary="How a simulated arm was made to move as a real one.",
+        label="Identifications",
+        reads=_is_identification,
+        lines=Late(f"{contents}:lines_of"),
+        make=Late(f"{contents}:read_contents"),
+    )
 
 
 @hookimpl

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ibrobot_core.api import HardwareError, MissingDependency, OptionFault, did_you_mean
+from ibrobot_core.app import ConfigError
 from ibrobot_mujoco.gl import check_asked
 from ibrobot_mujoco.options import MujocoOptions
+from ibrobot_mujoco.parameters import read_parameters
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
@@ -28,11 +31,24 @@ def _unusable(options: MujocoOptions, robot: Robot) -> Iterator[OptionFault]:
         yield OptionFault((), " ".join(str(error).split()))
 
 
+def _wrong_parameters(path: Path, robot: Robot) -> Iterator[OptionFault]:
+    """Faults of a file of parameters."""
+    try:
+        read_parameters(path, robot)
+    except ConfigError as error:
+        for problem in error.problems:
+            yield OptionFault(("parameters",), str(problem))
+
+
 def check_world(options: MujocoOptions, robot: Robot) -> Iterator[OptionFault]:
-    """Check that the robot has an MJCF, and that the pose and joints in the options exist."""
+    """Check that the robot has an MJCF, and that the parameters, the pose and joints in the options exist."""
     poses = list(robot.description.poses)
+    wrong = [] if options.parameters is None else list(_wrong_parameters(options.parameters, robot))
+    yield from wrong
     if robot.description.mjcf is None:
         yield OptionFault((), f"robot {robot.name!r} has no MJCF to simulate: set robot.description.mjcf", "mjcf")
+    elif wrong:
+        pass
     elif robot.description.mjcf.is_file():  # core has reported a missing one
         yield from _unusable(options, robot)
     if options.start_pose not in poses:

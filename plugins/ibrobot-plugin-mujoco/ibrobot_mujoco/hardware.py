@@ -24,6 +24,8 @@ from ibrobot_core.api import (
 from ibrobot_mujoco.faults import Faults
 from ibrobot_mujoco.model import build_world
 from ibrobot_mujoco.options import MujocoOptions
+from ibrobot_mujoco.parameters import read_parameters
+from ibrobot_mujoco.setpoints import Servos
 from ibrobot_mujoco.state import OBJECTS_TOPIC, PHYSICS_TOPIC, POSE_SIZE, SCENE_TOPIC, physics_size, write_physics
 
 _RELAXED = int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
@@ -60,7 +62,9 @@ class MujocoHardware(SimulatedHardware):
         self._faults = Faults(options.faults, ctx.joints)
         self._latency_ns = ns(options.latency)
         self._timestep_ns = ns(options.timestep)
-        self._stride = options.velocity_limit * options.timestep
+        parameters = read_parameters(options.parameters, ctx.robot) if options.parameters is not None else None
+        self._setpoints = Servos.of(parameters, ctx.joints, options)
+        self._delay_ns = self._latency_ns + ns(parameters.delay if parameters is not None else 0.0)
         size, values = physics_size(self._built, self._scene), self._scene.values
         physics = Signal(PHYSICS_TOPIC, size, "stamp, state and factors, for cameras and viewers")
         scene = Signal(SCENE_TOPIC, len(values), f"{', '.join(values)} [m, base frame]")
@@ -95,7 +99,7 @@ class MujocoHardware(SimulatedHardware):
         self._now_ns = self._stepped_ns = 0
         self._stamp_ns = self._ctx.clock.now_ns()
         self._target: Vector = physics.ctrl[self._servos]
-        self._setpoint = self._target.copy()
+        self._setpoints.restart(self._target)
         self._commands: deque[tuple[int, Vector | None]] = deque()
         self._samples = deque([self._sample()])
         self._last: JointReading | None = None
@@ -135,7 +139,7 @@ class MujocoHardware(SimulatedHardware):
         """Send a command (None: torque off); returns False if the bus is silent and loses it."""
         if self._faults.active("silent", self._now_ns):
             return False
-        self._commands.append((self._now_ns + self._latency_ns, command))
+        self._commands.append((self._now_ns + self._delay_ns, command))
         return True
 
     @override
@@ -169,12 +173,10 @@ class MujocoHardware(SimulatedHardware):
                 continue
             if self._model.opt.disableflags & _RELAXED:
                 self._model.opt.disableflags &= ~_RELAXED
-                self._setpoint = physics.qpos[self._qpos]
+                self._setpoints.restart(physics.qpos[self._qpos])
             command[frozen] = self._target[frozen]
             self._target = command
-        # This runs at every timestep, and takes half the time of np.clip.
-        self._setpoint += np.minimum(np.maximum(self._target - self._setpoint, -self._stride), self._stride)
-        physics.ctrl[self._servos] = self._setpoint
+        physics.ctrl[self._servos] = self._setpoints.step(self._target)
 
     def _sample(self) -> _Sample:
         physics = self._connected()

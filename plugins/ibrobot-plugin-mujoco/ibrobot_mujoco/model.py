@@ -15,8 +15,10 @@ from ibrobot_kinematics.rotations import quaternion
 from numpy.typing import NDArray
 
 from ibrobot_core.api import NS_PER_S, HardwareError, Robot, ns
+from ibrobot_core.app import ConfigError
 from ibrobot_mujoco.lowpoly import GRID_M, low_poly
 from ibrobot_mujoco.options import MujocoOptions, SceneCamera, SceneThing
+from ibrobot_mujoco.parameters import ArmParameters, read_parameters
 from ibrobot_mujoco.scene import Scene
 from ibrobot_mujoco.scenes.solids import FRICTION
 from ibrobot_mujoco.scenes.table import TABLE
@@ -80,6 +82,11 @@ def build_spec(options: MujocoOptions, robot: Robot) -> tuple[mujoco.MjSpec, Any
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10
     _tune_servos(spec, options, robot)
+    if options.parameters is not None:
+        try:
+            apply_parameters(spec, read_parameters(options.parameters, robot), robot)
+        except ConfigError as error:
+            raise HardwareError(str(error)) from None
     _add_surroundings(spec)
     scene: AnyScene = options.scene.make(robot)
     scene.build(spec)
@@ -92,6 +99,25 @@ def build_spec(options: MujocoOptions, robot: Robot) -> tuple[mujoco.MjSpec, Any
     for camera in options.cameras:
         _add_camera(spec, camera)
     return spec, scene
+
+
+def apply_parameters(spec: mujoco.MjSpec, parameters: ArmParameters, robot: Robot) -> None:
+    """Give servos and joints their parameters, before anything but the arm is in the model.
+
+    Delay, backlash and bias are not among those of MuJoCo; see `setpoints`.
+    """
+    actuators = {a.target: a for a in spec.actuators if a.trntype == mujoco.mjtTrn.mjTRN_JOINT}
+    for name in robot.joint_names:
+        each, servo, joint = parameters.joints[name], actuators[name], spec.joint(name)
+        servo.gainprm[0], servo.biasprm[1], servo.biasprm[2] = each.kp, -each.kp, 0.0
+        if each.torque_limit is not None:
+            servo.forcelimited = True
+            servo.forcerange = [-each.torque_limit, each.torque_limit]
+        for field in ("damping", "frictionloss", "armature"):
+            _set_joint(joint, field, getattr(each, field))
+    if parameters.gravity_compensation is not None:
+        for body in spec.bodies[1:]:
+            body.gravcomp = parameters.gravity_compensation
 
 
 def _tune_servos(spec: mujoco.MjSpec, options: MujocoOptions, robot: Robot) -> None:
@@ -195,12 +221,12 @@ def _strip(spec: mujoco.MjSpec) -> None:
     for geom in list(spec.geoms):
         if geom.type == _Mesh and not geom.contype and not geom.conaffinity and geom.parent.explicitinertial:
             spec.delete(geom)
-    _delete_unused_meshes(spec)
+    delete_unused_meshes(spec)
 
 
 def _simplify(spec: mujoco.MjSpec) -> None:
     """Replace visual STL meshes by low-poly ones; meshes in other formats are unchanged."""
-    _delete_unused_meshes(spec)
+    delete_unused_meshes(spec)
     colliding = {g.meshname for g in spec.geoms if g.type == _Mesh and (g.contype or g.conaffinity)}
     directory = Path(spec.modelfiledir) / spec.meshdir
     for mesh in spec.meshes:
@@ -215,7 +241,8 @@ def _simplify(spec: mujoco.MjSpec) -> None:
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
 
 
-def _delete_unused_meshes(spec: mujoco.MjSpec) -> None:
+def delete_unused_meshes(spec: mujoco.MjSpec) -> None:
+    """Delete the meshes that no geom has."""
     used = {geom.meshname for geom in spec.geoms if geom.type == _Mesh}
     for mesh in list(spec.meshes):
         if mesh_name(mesh) not in used:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import attrs
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from ibrobot_core.api import Robot, SceneObject
 
 Vec3 = tuple[float, float, float]
+_OF_ALL_JOINTS = ("kp", "kv", "damping", "frictionloss", "armature", "torque_limit")
+"""Options of all joints, which a file of parameters has for each joint."""
 
 
 @documented
@@ -86,6 +89,11 @@ class MujocoOptions(Options):
     timestep: float = option(0.002, unit="s", ge=1e-4, le=0.02, help="step of the physics")
     start_pose: str = option("rest", help="named pose of the robot at the beginning of an episode")
 
+    parameters: Path | None = option(
+        None,
+        help="how servos and joints behave: a file of `ibrobot identify`, or the published values of the SO-101's "
+        "servos, package://ibrobot_mujoco/servos/so101_sts3215.yaml; None: as in the MJCF",
+    )
     kp: float | None = option(None, unit="Nm/rad", gt=0, help="position gain of the servos")
     kv: float | None = option(None, unit="Nm s/rad", ge=0, help="velocity gain of the servos")
     damping: float | None = option(None, unit="Nm s/rad", ge=0, help="viscous friction of the joints")
@@ -100,6 +108,11 @@ class MujocoOptions(Options):
 
     objects: Mapping[str, SceneThing] = option(factory=dict, help="further objects, e.g. obstacles, by name")
     cameras: tuple[SceneCamera, ...] = option((), help="cameras in addition to `top`, `front` and those of the MJCF")
+
+    def __attrs_post_init__(self) -> None:
+        both = [name for name in _OF_ALL_JOINTS if getattr(self, name) is not None]
+        if self.parameters is not None and both:
+            raise ValueError(f"parameters and {both[0]} exclude each other: the file has it for each joint")
 
     def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
         """Check them against the robot and its MJCF."""

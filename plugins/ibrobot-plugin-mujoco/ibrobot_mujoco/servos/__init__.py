@@ -1,0 +1,1 @@
+"""Published parameters of servos, for `simulation.parameters`."""
