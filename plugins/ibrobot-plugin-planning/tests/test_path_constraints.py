@@ -202,6 +202,35 @@ def test_start_and_goal_that_break_a_constraint_are_refused_with_the_degrees(pla
     refused(planner, ask(outside), PlanCode.START_STATE_VIOLATES_PATH_CONSTRAINTS, words)
 
 
+def test_goal_with_a_tolerance_is_reached_where_the_constraint_holds(planner, engine):
+    near = ConstrainedGoal(JointGoal(ARM, ACROSS + TILT, tolerance=0.3), UPRIGHT)
+    result = planner.plan(ask(near))
+    assert tilt(tips(engine, result)[1]) <= TEN
+    far = ConstrainedGoal(JointGoal(ARM, ACROSS + TILT, tolerance=0.01), UPRIGHT)
+    refused(
+        planner, ask(far), PlanCode.GOAL_VIOLATES_PATH_CONSTRAINTS, r"upright: the tool's -z axis is 22\.92 degrees"
+    )
+
+
+def test_constraints_within_constraints_are_refused(planner):
+    inner = ConstrainedGoal(JointGoal(ARM, ACROSS), UPRIGHT)
+    nested: Any = ConstrainedGoal(AnyGoal((inner,)), UPRIGHT)  # type: ignore[arg-type]
+    refused(planner, ask(nested), PlanCode.INVALID_GOAL_CONSTRAINTS, "path constraints within path constraints")
+
+
+def test_search_that_nobody_wants_ends(planner):
+    calls = 0
+
+    def check_wanted() -> None:
+        nonlocal calls
+        calls += 1
+        if calls > 100:
+            raise PlanningError("cancelled", PlanCode.PREEMPTED)
+
+    goal = ConstrainedGoal(JointGoal(ARM, ACROSS), UPRIGHT)
+    refused(planner, ask(goal, check_wanted=check_wanted), PlanCode.PREEMPTED, "cancelled")
+
+
 def test_constraints_need_the_joints_of_the_tool(planner):
     goal = ConstrainedGoal(JointGoal(("pan",), np.zeros(1)), UPRIGHT)
     request = PlanRequest(ARM[:3], DOWN[:3], goal, others={"flex": DOWN[3]})
@@ -319,5 +348,5 @@ def test_text_that_makes_no_sense(robot, goal: str, message: str):
 
 def test_waypoints_leave_constraints_to_their_line():
     line: Mapping[str, Any] = {"xyz": (0.2, 0.0, 0.1), "path_constraints": UPRIGHT}
-    with pytest.raises(ValueError, match=r"line\.0: path_constraints hold on the whole line: give them beside it"):
+    with pytest.raises(ValueError, match=r"waypoints\.0: path_constraints hold on the whole line: give them beside"):
         CartesianQuery(waypoints=(GoalOptions(**line),))

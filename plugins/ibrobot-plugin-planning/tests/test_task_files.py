@@ -91,6 +91,22 @@ MALFORMED = {
         move("{any: [{pose: up}], beyond_reach: free}"),
         "steps.0.move: beyond_reach belongs to the goals in any",
     ),
+    "constraints beside any": (
+        move("{any: [{pose: up}], path_constraints: {upright: 0.1}}"),
+        "steps.0.move: path_constraints belongs to the goals in any",
+    ),
+    "constraints in a line": (
+        move("{line: [{xyz: [0, 0, 1], path_constraints: {upright: 0.1}}]}"),
+        "steps.0.move: line.0: path_constraints hold on the whole line: give them beside line",
+    ),
+    "unknown constraint": (
+        move("{pose: up, path_constraints: {uprigth: 0.1}}"),
+        "steps.0.move.path_constraints.uprigth: unknown key, did you mean 'upright'?",
+    ),
+    "no constraint": (
+        move("{pose: up, path_constraints: {}}"),
+        "steps.0.move.path_constraints: path constraints have at least one of upright, region, view; there is none",
+    ),
     "axis without position": (move("{pose: up, axis: down}"), "steps.0.move: axis needs a position: xyz or object"),
     "axis and orientation": (
         move("{xyz: [0, 0, 1], axis: up, rpy: [0, 0, 0]}"),

@@ -132,7 +132,7 @@ class CartesianQuery:
     path_constraints: PathConstraints | None = option(None, help="what holds on the whole line, e.g. {upright: 0.17}")
 
     def __attrs_post_init__(self) -> None:
-        check_waypoints(self.waypoints)
+        check_waypoints("waypoints", self.waypoints)
 
 
 @documented

@@ -184,17 +184,21 @@ def line_goal(
     return line if constraints is None else ConstrainedGoal(line, constraints)
 
 
-def check_waypoints(waypoints: Sequence[GoalOptions]) -> None:
+def check_waypoints(key: str, waypoints: Sequence[GoalOptions]) -> None:
     """Check that waypoints are positions, and leave path constraints to their line.
+
+    Args:
+        key: their key, for the error.
+        waypoints: the ends of straight lines.
 
     Raises:
         ValueError: for the first that is not, or does not.
     """
     for i, each in enumerate(waypoints):
         if not each.of_tool:
-            raise ValueError(f"line.{i}: a straight line goes to a position: xyz or object")
+            raise ValueError(f"{key}.{i}: a straight line goes to a position: xyz or object")
         if each.path_constraints is not None:
-            raise ValueError(f"line.{i}: path_constraints hold on the whole line: give them beside it")
+            raise ValueError(f"{key}.{i}: path_constraints hold on the whole line: give them beside {key}")
 
 
 def upright(thing: Pose) -> Vector:

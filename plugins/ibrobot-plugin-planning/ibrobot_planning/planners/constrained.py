@@ -48,6 +48,7 @@ class ConstrainedChecks:
 
     def whole(self, configurations: Vector) -> Vector:
         """Configurations of the planned joints, shape (…, J), completed with all others, shape (…, M)."""
+        self._contacts.before()
         whole = np.empty((*configurations.shape[:-1], len(self._whole)))
         whole[...] = self._whole
         whole[..., self._order] = configurations

@@ -180,7 +180,8 @@ class _Plan:
             PlanningError: if the start breaks them.
         """
         self._check_chain()
-        assert isinstance(self.checks, Collisions)
+        if isinstance(self.checks, ConstrainedChecks):
+            raise invalid_goal("the goal has path constraints within path constraints: give all of them in one")
         constraints = ToolConstraints(goal.constraints, self.tool.model, self._whole())
         checks = ConstrainedChecks(self.checks, constraints, self._whole(), self._order)
         if broken := checks.broken(self.start):
@@ -275,6 +276,8 @@ class _Plan:
             free = self._nearby(candidates[0].joints, goal)
         if free:
             return free
+        if self._constraints is not None:
+            candidates = self.tool.kept(goal, candidates, self._constraints, self._whole())
         least = min(
             (self.checks.contacts(candidate.joints[self._order]) for candidate in candidates),
             key=lambda contacts: contacts[0].padding - contacts[0].distance,

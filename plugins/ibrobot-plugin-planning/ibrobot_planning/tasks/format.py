@@ -39,7 +39,7 @@ class MoveStep(GoalOptions):
         super().__attrs_post_init__()
         if self.least_fraction != 1 and not self.line:
             raise ValueError("least_fraction belongs to line")
-        check_waypoints(self.line)
+        check_waypoints("line", self.line)
 
     @override
     def kinds(self) -> dict[str, bool]:
