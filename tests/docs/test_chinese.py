@@ -11,6 +11,8 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PAGES = sorted(path for path in (*ROOT.glob("*.zh.md"), *ROOT.glob("docs/**/*.zh.md")) if "images" not in path.parts)
 _BLOCK = re.compile(r"^```\w*\n.*?^```$", re.MULTILINE | re.DOTALL)
+_COMMENT = re.compile(r"(?<=\S)\s+# .*$", re.MULTILINE)
+"""What explains a command or a line of YAML."""
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
 _NUMBER = re.compile(r"\d+(?:[.,]\d+)*")
 
@@ -23,7 +25,7 @@ def content(path: Path) -> dict[str, list[str] | Counter[str]]:
     """What both languages share: blocks of code in their order; code in lines, links and figures, counted."""
     text = path.read_text(encoding="utf-8")
     text = re.sub(r"^.*English.* \| .*中文.*$", "", text, count=1, flags=re.MULTILINE)
-    blocks = _BLOCK.findall(text)
+    blocks = [_COMMENT.sub("", each) for each in _BLOCK.findall(text) if not each.startswith("```text")]  # drawings
     prose = _BLOCK.sub("", text).replace("\n", " ")
     code = [" ".join(each.split()) for each in re.findall(r"`[^`]+`", prose)]
     links = [link.replace(".zh.md", ".md") for link in _LINK.findall(prose) if not link.startswith("README")]
