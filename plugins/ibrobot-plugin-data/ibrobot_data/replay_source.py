@@ -129,8 +129,7 @@ class ReplaySource(SourceWorker):
             return
         self.active = False
         if self._success is not None and self._playback.outcome == "success":
-            session.outcome.episodes += 1
-            session.outcome.successes += self._success
+            session.episodes.end("success" if self._success else "failure")
         session.finish()
 
     @override
