@@ -65,6 +65,7 @@ def test_in_lockstep_the_cube_comes_into_the_bin_again(replay: Command, picks: P
         assert done.returncode == 0, done.stderr
         summary = json.loads(done.stdout.splitlines()[-1])
         assert summary["replay"]["success"] is True
+        assert (summary["episodes"], summary["successes"], summary["unjudged"]) == (1, 1, 0)
         assert len(summary["replay"]["tracking"]) == 6
         assert max(each["max_rad"] for each in summary["replay"]["tracking"].values()) < 1e-6
 
