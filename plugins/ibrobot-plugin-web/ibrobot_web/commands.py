@@ -173,7 +173,7 @@ class Commands:
         return _HANDLERS[type(sent.command)](self._session, sent)
 
     def _abandon(self) -> None:
-        """End the episode that a page began, if it goes on: nobody could do it, and an idle arm would be recorded."""
+        """End the episode that a page began, if it goes on: nobody does, and an idle arm would be recorded."""
         if not self._begun:
             return
         bus = self._session.bus
@@ -182,7 +182,7 @@ class Commands:
             return
         ends = ("discard", None) if status.waiting else ("stop", "unknown")
         bus.call(f"{_RECORD}/{ends[0]}", ends[1])
-        _log.warning("the page that operated is gone: the episode that it began has ended, not judged")
+        _log.warning("the page was closed or loaded again, and nobody went on: its episode has ended, not judged")
 
 
 def _waiting[T](waiting: queue.SimpleQueue[T]) -> list[T]:

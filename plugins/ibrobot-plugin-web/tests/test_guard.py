@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import json
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from typing import Any, override
@@ -201,8 +202,8 @@ def test_only_the_operator_commands_and_taking_over_is_explicit() -> None:
     run(test)
 
 
-@pytest.mark.parametrize("loads_again", [True, False])
-def test_the_run_learns_that_the_operators_page_is_gone(loads_again: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("then", ["goes on", "loads again and waits", "is gone"])
+def test_the_run_learns_that_the_operators_page_is_gone(then: str, monkeypatch: pytest.MonkeyPatch) -> None:
     waits: list[Callable[[], None]] = []
 
     async def test(server: Server) -> None:
@@ -211,7 +212,7 @@ def test_the_run_learns_that_the_operators_page_is_gone(loads_again: bool, monke
 
         def call_later(seconds: float, act: Callable[..., None], *given: Any, **more: Any) -> Any:
             if act == server.drive._give_up:  # the wait ends when the test says so
-                return waits.append(act)
+                return waits.append(functools.partial(act, *given))
             return later(seconds, act, *given, **more)
 
         monkeypatch.setattr(loop, "call_later", call_later)
@@ -222,10 +223,13 @@ def test_the_run_learns_that_the_operators_page_is_gone(loads_again: bool, monke
             await socket.close()
             while not waits:
                 await asyncio.sleep(0.01)
-            if loads_again:
-                await call(await browser.ws_connect("/drive"), **MODE)
+            if then != "is gone":
+                again = await browser.ws_connect("/drive")
+                await call(again, do="time")
+                if then == "goes on":
+                    await call(again, **MODE)
             waits[0]()
-            assert (Abandoned() in server.executed) == (not loads_again)
+            assert (Abandoned() in server.executed) == (then != "goes on")
 
     run(test)
 

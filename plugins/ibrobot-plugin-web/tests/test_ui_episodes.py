@@ -75,6 +75,17 @@ def test_an_overview_counts_what_the_folders_contain(episode: Path, tmp_path: Pa
     run_ui([tmp_path], test)
 
 
+def test_an_overview_counts_trainings_not_their_checkpoints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = [tmp_path / f"training/pick/checkpoints/{step}/pretrained_model" for step in ("000010", "000020")]
+    alone = tmp_path / "of_a_friend"
+    monkeypatch.setattr("ibrobot_web.ui.robots.find_policies", lambda ui: [(path, "act") for path in (*steps, alone)])
+
+    async def test(server: UiServer) -> None:
+        assert (await server.get("robots/overview"))["policies"] == ["of_a_friend", "training/pick"]
+
+    run_ui([tmp_path], test)
+
+
 def brightness(picture: Any) -> int:
     import simplejpeg
 

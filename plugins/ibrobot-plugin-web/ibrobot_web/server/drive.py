@@ -40,7 +40,7 @@ _BURST = 200
 _OPEN_COMMANDS = 32
 """Commands of a page that may wait for their replies."""
 _ABANDONED_S = 5.0
-"""Time without an operator whose page was closed, e.g. while it loads again, until the run gets `Abandoned` [s]."""
+"""Time in which nobody goes on once the operator's page was closed or loaded again; then the run gets `Abandoned` [s]."""
 _STOP_S = 5.0
 """Longest wait for the confirmation of a stop that was sent as a request [s]."""
 
@@ -88,6 +88,8 @@ class Drive:
         self._drivers: dict[int, Driver] = {}
         self._numbers = itertools.count(1)
         self.operator: Driver | None = None
+        self._deserted = 0
+        """Number of the operator's page that was closed last; 0 once another one has sent a command."""
         self.refused = 0
         """Number of refused messages."""
 
@@ -125,14 +127,15 @@ class Drive:
             if self.operator is driver:
                 self.operator = None
                 self._release()
-                asyncio.get_running_loop().call_later(_ABANDONED_S, self._give_up)
+                self._deserted = number
+                asyncio.get_running_loop().call_later(_ABANDONED_S, self._give_up, number)
             self.announce()
             sending.cancel()
             await asyncio.gather(sending, return_exceptions=True)
             await socket.close(code=1008 if driver.malformed >= _MALFORMED else 1000)
 
-    def _give_up(self) -> None:
-        if self.operator is None:
+    def _give_up(self, number: int) -> None:
+        if self._deserted == number:
             self._execute(Sent(None, None, Abandoned()), lambda reply: None)
 
     async def serve_stop(self, socket: web.WebSocketResponse, role: str) -> None:
@@ -220,6 +223,8 @@ class Drive:
         if self.operator is not driver:
             operator = self.operator.name if self.operator is not None else "nobody"
             raise CommandRefused(f"this page only watches; the operator is {operator}: take over first")
+        if not isinstance(sent.command, Release):
+            self._deserted = 0
         if sent.number is None:
             self._execute(sent, lambda reply: None)
             return

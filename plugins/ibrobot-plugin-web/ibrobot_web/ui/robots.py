@@ -144,9 +144,14 @@ def overview(ui: Ui) -> dict[str, Any]:
         "unjudged": sum(row["outcome"] == "unknown" for row in rows),
         "newest": [{name: row[name] for name in ("path", "task", "outcome", "began_s")} for row in newest[:3]],
         "datasets": list(map(ui.folders.name, recordings.datasets)),
-        "policies": [ui.folders.name(path) for path, _ in find_policies(ui)],
+        "policies": sorted({ui.folders.name(_training_of(path)) for path, _ in find_policies(ui)}),
         "reports": sum(map(len, recordings.reports.values())),
     }
+
+
+def _training_of(policy: Path) -> Path:
+    """The folder of the training whose checkpoint a policy is, or of the policy itself."""
+    return next((each.parent for each in policy.parents if each.name == "checkpoints"), policy)
 
 
 def launch(ui: Ui, robot: str, sim: bool = False, mode: str = "") -> dict[str, int]:
