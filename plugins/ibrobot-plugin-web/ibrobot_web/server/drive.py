@@ -40,7 +40,7 @@ _BURST = 200
 _OPEN_COMMANDS = 32
 """Commands of a page that may wait for their replies."""
 _ABANDONED_S = 5.0
-"""Time in which nobody goes on once the operator's page was closed or loaded again; then the run gets `Abandoned` [s]."""
+"""Time in which nobody goes on after the operator's page was closed or loaded again; then comes `Abandoned` [s]."""
 _STOP_S = 5.0
 """Longest wait for the confirmation of a stop that was sent as a request [s]."""
 
