@@ -12,6 +12,8 @@ from ibrobot_mcp.stdio import take_standard_pipes
 
 TASKS = "tasks"
 """A section that serves tasks and their steps, which agents use, if a package offers it."""
+DETECT = "detect"
+"""A section that finds objects, likewise."""
 
 
 @attrs.frozen(kw_only=True)
@@ -33,8 +35,8 @@ class RunMcp(ModeOptions):
             mode = planning[0] if planning else None
         known = {each.type for each in installed_plugins().of_kind("section")}
         more = [f"{SECTION}={{http: false}}"] if SECTION not in robot.plugin_sections else []
-        if mode is not None and TASKS in known - set(robot.plugin_sections):
-            more.append(f"{TASKS}={{}}")
+        wanted = {DETECT, *([TASKS] if mode is not None else [])}
+        more += [f"{each}={{}}" for each in sorted(wanted & known - set(robot.plugin_sections))]
         robot = self.load(mode, (*self.changes(), *more))
         pipes = take_standard_pipes() if not self.dry_run else None
 
