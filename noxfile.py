@@ -52,6 +52,7 @@ LOCAL = {
 EXAMPLES = {"ibrobot-plugin-jointlog": Path("tests/examples/ibrobot-plugin-jointlog")}
 """As `LOCAL`, of what tests install and nobody publishes."""
 EXTRAS = {
+    "ibrobot-gym": "[inspect]",
     "ibrobot-plugin-camera": "[realsense]",
     "ibrobot-plugin-lerobot": "[hub]",
     "ibrobot-plugin-mcap": "[plot]",

@@ -97,6 +97,9 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         render_mode: `rgb_array`, or None.
         render_camera: the camera that `render` shows.
 
+    Attributes:
+        config: the checked robot YAML.
+
     Raises:
         ConfigError: for faults of the robot YAML.
     """
@@ -119,16 +122,16 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.render_mode = render_mode
         self.task = self.task_description = task
         rendered = render_camera if render_mode is not None else None
-        self._config = environment_config(config, scene, cameras, image_size, rendered, overrides)
-        self._contract = Contract.from_config(self._config)
-        self.metadata = {**self.metadata, "render_fps": round(self._config.contract.rate_hz)}  # type: ignore[misc]
-        robot, joints = self._config.robot, self._contract.action_joints
+        self.config = environment_config(config, scene, cameras, image_size, rendered, overrides)
+        self._contract = Contract.from_config(self.config)
+        self.metadata = {**self.metadata, "render_fps": round(self.config.contract.rate_hz)}  # type: ignore[misc]
+        robot, joints = self.config.robot, self._contract.action_joints
         columns = robot.indices(joints)
         lower, upper = robot.lower[columns].astype(np.float32), robot.upper[columns].astype(np.float32)
         self._limits = robot.lower[columns], robot.upper[columns]
         self.action_space = spaces.Box(lower, upper, dtype=np.float32)
-        self._longest_ns = ns(self._config.contract.max_duration_s)
-        self._max_episode_steps = math.ceil(self._config.contract.max_duration_s * self._config.contract.rate_hz) + 1
+        self._longest_ns = ns(self.config.contract.max_duration_s)
+        self._max_episode_steps = math.ceil(self.config.contract.max_duration_s * self.config.contract.rate_hz) + 1
         self._session: Session | None = None
         self._generation = 0
         """Generation of the episode; it changes when the robot is stopped or reset."""
@@ -160,7 +163,7 @@ class RobotEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             return self._source
 
         request = LaunchRequest(lockstep=True, source=source)
-        self._session = session = Session(self._config, installed_plugins(), request)
+        self._session = session = Session(self.config, installed_plugins(), request)
         self._runtime = Runtime(session)
         if self.render_mode is not None:
             self._rendered = session.bus.subscribe(_RENDERED_TOPIC, 1)
