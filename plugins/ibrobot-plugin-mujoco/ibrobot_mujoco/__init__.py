@@ -104,6 +104,7 @@ def ibrobot_reports() -> Iterable[ReportDescriptor]:
         KIND,
         summary="How a simulated arm was made to move as a real one.",
         label="Identifications",
+        command="identify",
         reads=_is_identification,
         lines=Late(f"{contents}:lines_of"),
         make=Late(f"{contents}:read_contents"),

@@ -33,7 +33,7 @@ GROUPS = {
 of report has one, all by `static/ui/reports.js`."""
 SHOWN = {"episodes": "datasets", "dataset": "policies"}
 """Kind of a command's input -> the view before which its own stands; others are in the last group."""
-PLACED = {"explain": "Evaluate", "preflight": "Set up"}
+PLACED = {"explain": "Evaluate", "identify": "Set up", "preflight": "Set up"}
 """Command -> the group at whose end it stands, where its input would put it into another one."""
 ROUTED = (*(name for names in GROUPS.values() for name in names), "reports")
 """The modules with `ROUTES`."""
