@@ -541,12 +541,29 @@ class TestBuildingBesideTheLoop:
         assert loop.go(ACROSS)[0] > 0
         assert loop.guard.counts["world_changes"] == 301
 
+    def test_a_cloud_is_built_in_steps_between_which_the_loop_may_run(self, tmp_path, monkeypatch) -> None:
+        loop, steps = Loop(tmp_path), list[bool]()
+        monkeypatch.setattr(ClearanceGuard, "_give_way", lambda guard: steps.append(guard._is_checking))
+        cells = np.array(list(itertools.product(range(20), range(20), range(3))))
+        loop.world({"cloud": WorldObject(Voxels(0.02, cells))})
+        assert len(steps) > 6
+
+    def test_worlds_do_not_pile_up_while_the_loop_takes_none(self, tmp_path) -> None:
+        """Nor are motions of objects lost among them."""
+        loop = Loop(tmp_path, LEFT)
+        loop.world(WALL)
+        for number in range(200):
+            loop.world({f"object{number % 5}": box(1, 1, 1 + number / 100, 0.1, 0.1, 0.1)}, f"object{(number + 1) % 5}")
+            loop.world({"wall": box(0.35, -0.6 + number * 0.6 / 199, 0.15, 0.4, 0.02, 0.3)})
+        assert len(loop.guard._building.finished) <= 33
+        assert 0 < loop.go(ACROSS)[0] < LEFT[0] - 0.3
+
     def test_a_world_that_cannot_be_built_is_one_that_is_not_known(self, tmp_path, monkeypatch, caplog) -> None:
         loop = Loop(tmp_path, LEFT)
         make = loop.guard._building._make
         failing = True
 
-        def made(world: World, before: Pairs) -> Any:
+        def made(world: World, before: Pairs | None) -> Any:
             if failing:
                 raise MemoryError("no room")
             return make(world, before)

@@ -18,6 +18,8 @@ from ibrobot_planning.world.arm import Arm
 from ibrobot_planning.world.coal_shapes import geometry
 from ibrobot_planning.world.objects import Voxels, World
 
+_MOST_WAITING = 32
+"""Worlds that wait for a loop that takes none, e.g. since the robot holds after a fault; then one takes their place."""
 _SWITCH_S = 0.0005
 """How long the thread may keep the loop of the same process waiting [s]; 5 ms is Python's default."""
 
@@ -42,14 +44,15 @@ class Building:
     Args:
         arm: the arm.
         permit: adds to a world what the guard knows besides, and what may be touched.
-        make: makes the pairs of such a world, with parts of those of the world before.
+        make: makes the pairs of such a world, with parts of those of the world before, if there are any.
         pairs: those of the world without objects.
         log: for objects that are left out.
         in_thread: whether to build in a thread; else in `add`, as stepped time needs it.
     """
 
     def __init__(
-        self, arm: Arm, permit: Callable[[World], World], make: Callable[[World, Pairs], Pairs], pairs: Pairs,
+        self, arm: Arm, permit: Callable[[World], World], make: Callable[[World, Pairs | None], Pairs],
+        pairs: Pairs,
         log: logging.Logger, *, in_thread: bool,
     ) -> None:  # fmt: skip
         self._arm, self._permit, self._make, self._log = arm, permit, make, log
@@ -103,7 +106,11 @@ class Building:
         try:
             world = self._permit(world)
             moved = WorldChange.between(self._made, world).only_moved(self._made)
-            if moved is None:
+            if len(self.finished) >= _MOST_WAITING:
+                self._pairs = self._make(world, None)
+                self.finished.clear()
+                self.finished.append(Finished(stale, self._pairs))
+            elif moved is None:
                 self._pairs = self._make(world, self._pairs)
                 self.finished.append(Finished(stale, self._pairs))
             else:

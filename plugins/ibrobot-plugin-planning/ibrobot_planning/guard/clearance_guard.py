@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Mapping
 from typing import Any, override
 
@@ -32,6 +33,8 @@ _MOST = 300
 """How much is looked at in a tick, which bounds its time; see `Pairs.left`."""
 _MOST_BLOCKING = 24
 """Pairs of which a motion that slides takes account: the nearest ones."""
+_WAIT_S, _MOST_WAITS = 0.0005, 20
+"""How long, and how often, the thread that builds worlds waits for the loop [s]."""
 _ROUNDS = 3
 """How often a motion that slides is changed because of further pairs."""
 _SWEEPS = 8
@@ -71,6 +74,7 @@ class ClearanceGuard(Guard):
         self._permissions = Permissions(options, robot, self._arm)
         self._begin: Vector = np.zeros(len(self._arm.joint_names))
         """The configuration of the model at the last command [rad], shape (M,)."""
+        self._is_checking = False
         self._pairs = self._made(self._permissions.applied(World()), None)
         in_thread = not isinstance(context.clock, SteppedClock)
         self._building = Building(
@@ -106,7 +110,12 @@ class ClearanceGuard(Guard):
     def accept(self, position: Vector, velocity: Vector, setpoint: Vector, measured: Vector) -> Vector:
         columns = self._joints.columns
         accepted: Vector = setpoint.copy()
-        accepted[columns] = self._checked(position[columns], velocity[columns], setpoint[columns], measured[columns])
+        self._is_checking = True
+        try:
+            own = (each[columns] for each in (position, velocity, setpoint, measured))
+            accepted[columns] = self._checked(*own)
+        finally:
+            self._is_checking = False
         return accepted
 
     def _checked(self, position: Vector, velocity: Vector, setpoint: Vector, measured: Vector) -> Vector:
@@ -236,10 +245,17 @@ class ClearanceGuard(Guard):
         margins = {} if options.base is None else {BASE: options.base.margin}
         made = Pairs(
             self._arm, world, margin=options.margin, self_margin=options.self_margin, pressed=pressed, margins=margins,
-            before=before,
+            before=before, pause=self._give_way,
         )  # fmt: skip
         made.estimate(self._begin, before)
         return made
+
+    def _give_way(self) -> None:
+        """Wait while the loop checks a command, but not for ever: two threads that run by turns take twice as long."""
+        for _ in range(_MOST_WAITS):
+            if not self._is_checking:
+                return
+            time.sleep(_WAIT_S)
 
     def _strayed(self, pair: int) -> str:
         """The joint that is off its commands so far that a pair must stay apart by more than twice its margin."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -43,11 +43,13 @@ class Pairs:
         pressed: pairs that may touch -> how deep they may lie in one another [m].
         margins: links with another `margin` -> their own [m].
         before: the pairs of the world before, whose parts are used again where they are the same.
+        pause: called between steps of a millisecond or two, so that another thread may run.
     """
 
     def __init__(
         self, arm: Arm, world: World, *, margin: float, self_margin: float, pressed: Mapping[Pair, float],
         margins: Mapping[str, float] | None = None, before: Pairs | None = None,
+        pause: Callable[[], None] = lambda: None,
     ) -> None:  # fmt: skip
         world.check(arm.frames)
         carried = World({name: thing for name, thing in world.objects.items() if thing.link is not None})
@@ -56,7 +58,11 @@ class Pairs:
         self.moving: Moving = Moving.of(arm, carried) if known is None else known.moving
         of_before = [] if known is None else known.parts
         robot = of_before[0] if of_before else Part(self.moving, {})
-        self.parts: Sequence[Part] = [robot, *parts(self.moving, standing, of_before[1:])]
+        self._pause = pause
+        self.parts: list[Part] = [robot]
+        for part in parts(self.moving, standing, of_before[1:]):
+            self.parts.append(part)
+            pause()
         self._data = arm.model.createData()
         self.names: Sequence[Pair] = [names for part in self.parts for names in part.names]
         sizes = [len(part.names) for part in self.parts]
@@ -67,12 +73,16 @@ class Pairs:
         self._number = np.arange(len(self.names)) - begins[self._of]
         """The pair's number in its part, shape (P,)."""
         own = margins or {}
-        self.margins: Vector = np.array([
-            -pressed[pair] if (pair := sorted_pair(a, b)) in pressed
-            else own.get(a, own.get(b, margin)) if a in standing or b in standing
-            else self_margin
-            for a, b in self.names
-        ], dtype=float)  # fmt: skip
+        least: list[float] = []
+        for part in self.parts:
+            least += [
+                -pressed[pair] if (pair := sorted_pair(a, b)) in pressed
+                else own.get(a, own.get(b, margin)) if a in standing or b in standing
+                else self_margin
+                for a, b in part.names
+            ]  # fmt: skip
+            pause()
+        self.margins: Vector = np.array(least, dtype=float)
         """Least distance of each pair [m], shape (P,)."""
         self.limits = self.margins.copy()
         """The same, or less for pairs that were nearer when they were first seen [m], shape (P,)."""
@@ -137,13 +147,12 @@ class Pairs:
         """
         shared = set() if other is None else {id(part) for part in other.parts}
         self._set(q)
-        near = []
         for part, at in zip(self.parts, self._slices, strict=True):
             if id(part) not in shared:
                 self._known[at], self._at[at] = part.apart(self._data), q
-                near.append(at.start + np.flatnonzero(self._known[at] < _NEAR_M))
-        if near:
-            self.distances(q, np.concatenate(near))
+                near = at.start + np.flatnonzero(self._known[at] < _NEAR_M)
+                self.distances(q, near)
+                self._pause()
 
     def unproved(self, least: Vector, most: Vector, strays: Vector) -> Indices:
         """Which pairs may come nearer than their margins while joints are within bounds, each of shape (J,).

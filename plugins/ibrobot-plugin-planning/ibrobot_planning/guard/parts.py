@@ -14,9 +14,10 @@ from ibrobot_kinematics.poses import matrix
 
 from ibrobot_core.api import Vector
 from ibrobot_planning.world.arm import Arm, LinkShape, Pair
+from ibrobot_planning.world.checked_arm import link_hulls
 from ibrobot_planning.world.coal_shapes import geometry, hull
 from ibrobot_planning.world.collision import Engine, checked_pairs, object_shapes
-from ibrobot_planning.world.objects import Voxels, World, WorldObject
+from ibrobot_planning.world.objects import Box, Voxels, World, WorldObject
 
 _MOST = 16
 """Objects of a part, or blocks of cells: one call that makes a part takes no longer, and the loop waits for calls."""
@@ -24,8 +25,8 @@ _BLOCK = 3
 """Edge of a block of cells, in cells; it counts as the convex hull of its cells."""
 _MOST_BLOCKS = 2000
 """Blocks of a cloud; of one that has more, blocks are larger."""
-_CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
-"""Of a cube of length 1."""
+_CORNERS = np.array(list(product((0, 1), repeat=3)))
+"""Of a cell, from its index on."""
 _CONVEX = (coal.Halfspace, coal.Box, coal.Sphere, coal.Capsule, coal.Cylinder, coal.ConvexBase)
 
 
@@ -41,13 +42,23 @@ class Moving:
     """The others, e.g. of the base."""
     levers: Vector
     """As of `_levers`, shape (S, J)."""
+    coarse: Moving | None = None
+    """With one hull in place of the shapes of each link, for clouds, whose many blocks are coarse themselves."""
 
     @classmethod
     def of(cls, arm: Arm, carried: World) -> Self:
         """Those of an arm, and of objects with links."""
-        shapes = [*arm.shapes, *object_shapes(arm, carried)]
+        links: dict[str, list[LinkShape]] = {}
+        for shape in arm.shapes:
+            links.setdefault(shape.link, []).append(shape)
+        hulls = [shape for shapes in links.values() for shape in link_hulls(shapes)]
+        return cls._made(arm, carried, arm.shapes, cls._made(arm, carried, hulls, None))
+
+    @classmethod
+    def _made(cls, arm: Arm, carried: World, links: Sequence[LinkShape], coarse: Moving | None) -> Self:
+        shapes = [*links, *object_shapes(arm, carried)]
         moved = [shape for shape in shapes if shape.joint]
-        return cls(arm, carried, moved, [shape for shape in shapes if not shape.joint], _levers(arm, moved))
+        return cls(arm, carried, moved, [shape for shape in shapes if not shape.joint], _levers(arm, moved), coarse)
 
 
 class Part:
@@ -58,17 +69,19 @@ class Part:
     Args:
         moving: what moves.
         objects: the objects that stand.
-        blocks: names of objects, each with one of several shapes of Coal that are in place of the object's own.
+        blocks: names of objects, each with one of several shapes of Coal in place of the object's own, and its place in
+            the object's frame.
     """
 
     def __init__(
-        self, moving: Moving, objects: Mapping[str, WorldObject], blocks: Sequence[tuple[str, Any]] = ()
+        self, moving: Moving, objects: Mapping[str, WorldObject], blocks: Sequence[tuple[str, Any, Vector]] = ()
     ) -> None:
         arm, self.objects = moving.arm, dict(objects)
         self._model = arm.model
         standing = [
-            LinkShape(name, 0, matrix(objects[name].pose), shape)
-            for name, shape in blocks or [(name, geometry(thing.shape)) for name, thing in objects.items()]
+            LinkShape(name, 0, matrix(objects[name].pose) @ within, shape)
+            for name, shape, within in blocks
+            or [(name, geometry(thing.shape), np.eye(4)) for name, thing in objects.items()]
         ]
         count = len(moving.moved)
         shapes = [*moving.moved, *(standing or moving.still)]
@@ -109,6 +122,8 @@ class Part:
         self._numbers: dict[str, list[int]] = {name: [] for name in objects}
         for number in range(count, count + len(standing)):
             self._numbers[shapes[number].link].append(number)
+        self._within = [block[2] for block in blocks] or [np.eye(4)] * len(standing)
+        self._first = count
 
     def place(self, data: Any) -> None:
         """Have all shapes where the joints of a pinocchio.Data are."""
@@ -126,7 +141,8 @@ class Part:
         """Have an object at `placement`, a pinocchio.SE3; returns its pairs."""
         numbers = self._numbers[name]
         for number in numbers:
-            self.geometry.geometryObjects[number].placement = placement
+            within = pinocchio.SE3(self._within[number - self._first])
+            self.geometry.geometryObjects[number].placement = placement * within
         return np.flatnonzero(np.isin(self.ends, numbers).any(axis=1))
 
 
@@ -147,7 +163,7 @@ def parts(moving: Moving, standing: Mapping[str, WorldObject], before: Sequence[
             continue
         if isinstance(thing.shape, Voxels):
             for blocks in batched(_blocks(thing.shape), _MOST):
-                yield Part(moving, {name: thing}, [(name, block) for block in blocks])
+                yield Part(moving.coarse or moving, {name: thing}, [(name, *block) for block in blocks])
         else:
             simple.append((name, thing))
     for some in batched(simple, _MOST):
@@ -164,18 +180,31 @@ def _alike(a: WorldObject, b: WorldObject) -> bool:
     return a == b
 
 
-def _blocks(cloud: Voxels) -> Iterator[Any]:
-    """Shapes of Coal that contain the cells, neighbours in one: a convex one takes a fiftieth of an octree's time."""
-    edge, cells = _BLOCK, cloud.cells
+def _blocks(cloud: Voxels) -> Iterator[tuple[Any, Vector]]:
+    """Shapes of Coal that contain the cells, neighbours in one, each with its place in the frame of the cloud.
+
+    A convex shape takes a fiftieth of the time of an octree.
+    """
+    edge, cells = _BLOCK, np.unique(cloud.cells, axis=0)
     while True:
         _, which = np.unique(cells // edge, axis=0, return_inverse=True)
         if which.max() < _MOST_BLOCKS:
             break
         edge *= 2
     order = np.argsort(which, kind="stable")
-    for numbers in np.split(order, np.flatnonzero(np.diff(which[order])) + 1):
-        centres = (cells[numbers] + 0.5) * cloud.size
-        yield hull((centres[:, None] + _CORNERS * cloud.size).reshape(-1, 3))
+    cells, begins = cells[order], np.flatnonzero(np.diff(which[order], prepend=-1))
+    lowest, highest = np.minimum.reduceat(cells, begins), np.maximum.reduceat(cells, begins) + 1
+    is_box = np.prod(highest - lowest, axis=1) == np.diff(begins, append=len(cells))
+    for number, block in enumerate(np.split(cells, begins[1:])):
+        low, high, placed = lowest[number], highest[number], np.eye(4)
+        if is_box[number]:
+            placed[:3, 3] = (low + high) / 2 * cloud.size
+            yield geometry(Box(tuple((high - low) * cloud.size))), placed
+            continue
+        placed[:3, 3] = low * cloud.size
+        corners = (block[:, None] - low + _CORNERS).reshape(-1, 3)
+        _, first = np.unique(corners @ (1, edge + 1, (edge + 1) ** 2), return_index=True)
+        yield hull(corners[first] * cloud.size), placed
 
 
 def _has_sphere(shape: LinkShape) -> bool:

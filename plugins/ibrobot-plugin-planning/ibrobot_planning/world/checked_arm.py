@@ -100,7 +100,7 @@ def with_hulls(arm: Arm) -> Arm:
     of_links: dict[str, list[LinkShape]] = {}
     for shape in arm.shapes:
         of_links.setdefault(shape.link, []).append(shape)
-    hulls: dict[str, Sequence[LinkShape]] = {link: _hulls(shapes) for link, shapes in of_links.items()}
+    hulls: dict[str, Sequence[LinkShape]] = {link: link_hulls(shapes) for link, shapes in of_links.items()}
     while True:
         few = tuple(shape for shapes in hulls.values() for shape in shapes)
         if len(few) == len(arm.shapes):
@@ -121,7 +121,7 @@ def with_hulls(arm: Arm) -> Arm:
         hulls[link] = of_links[link]
 
 
-def _hulls(shapes: Sequence[LinkShape]) -> Sequence[LinkShape]:
+def link_hulls(shapes: Sequence[LinkShape]) -> Sequence[LinkShape]:
     """One shape that contains the convex shapes of a link, and the others."""
     points, others = [], []
     for shape in shapes:
