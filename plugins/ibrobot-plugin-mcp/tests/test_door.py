@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import os
+import re
 import socket
 import stat
 import threading
@@ -470,6 +471,49 @@ def test_user_without_a_name_may_grant(door: AgentDoor, monkeypatch: pytest.Monk
     grant = authority_of(door.session).status().grant
     assert grant is not None
     assert grant.by == str(os.getuid())
+
+
+@pytest.mark.parametrize(
+    ("service", "why"),
+    [
+        ("/set_mdoe", "--allow /set_mdoe: nobody serves it in mode idle, did you mean '/set_mode'?"),
+        ("/agent/arm", "--allow /agent/arm: it is for persons only, and cannot be granted"),
+        ("/agent/status", "--allow /agent/status: it moves nothing, so that it needs no grant"),
+        ("/agent/disarm", "--allow /agent/disarm: it moves nothing, so that it needs no grant"),
+        ("", "--allow : nobody serves it"),
+    ],
+)
+def test_services_that_cannot_be_granted_are_refused_with_the_reason(door: AgentDoor, service: str, why: str) -> None:
+    authority_of(door.session).join("claude")
+    with pytest.raises(IbrobotError, match=re.escape(why)):
+        ask(next(running()), "/agent/arm", {"seconds": 60, "services": [service]})
+    ask(next(running()), "/agent/arm", {"seconds": 60, "services": ["/set_mode", "/planning/go_to"]})
+
+
+def test_several_persons_are_answered_at_once(door: AgentDoor) -> None:
+    with contextlib.ExitStack() as stack:
+        for _ in range(5):  # these say nothing
+            idle = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
+            idle.connect(str(next(running())))
+        assert ask(next(running()), "/agent/status")["agents"] == []
+
+
+def test_an_agent_cannot_take_the_sessions_of_others(door: AgentDoor, token: str) -> None:
+    other = add_token("hostile")
+
+    async def talk() -> list[int]:
+        first = {
+            "jsonrpc": "2.0", "id": 1, "method": "initialize",
+            "params": {
+                "protocolVersion": "2025-06-18", "capabilities": {}, "clientInfo": {"name": "x", "version": "1"},
+            },
+        }  # fmt: skip
+        accepts = {"Accept": "application/json, text/event-stream"}
+        async with bearer(other) as bad, bearer(token) as http:
+            taken = [(await bad.post(door.url, json=first, headers=accepts)).status_code for _ in range(10)]
+            return [*taken, (await http.post(door.url, json=first, headers=accepts)).status_code]
+
+    assert asyncio.run(talk()) == [200] * 8 + [503] * 2 + [200]
 
 
 def test_region_that_is_given_twice_is_refused(door: AgentDoor) -> None:
