@@ -47,7 +47,8 @@ def test_views_stand_in_groups_in_the_order_of_the_work() -> None:
     assert [name for name in groups["Learn"] if name not in learn] == ["datasets", "policies"]
     assert set(learn) <= set(groups["Learn"])
     assert "job-eval" in groups["Evaluate"]
-    for name, group in (("explain", "Evaluate"), ("identify", "Set up"), ("preflight", "Set up")):  # by what a person wants with them
+    # By what a person wants with them.
+    for name, group in (("explain", "Evaluate"), ("identify", "Set up"), ("preflight", "Set up")):
         found = [each for each, members in groups.items() if f"job-{name}" in members]
         assert found == ([group] if takes(name) else [])
 
