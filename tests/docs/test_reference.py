@@ -10,7 +10,9 @@ from pathlib import Path
 import ibrobot_testing
 import pytest
 
-from ibrobot_core import api, hookspecs, interfaces
+from ibrobot_core import hookspecs, interfaces
+from ibrobot_core.descriptors import Late
+from ibrobot_core.interfaces import guard
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -31,18 +33,48 @@ def test_no_hook_is_documented_that_is_none() -> None:
     assert documented == list(_signatures())
 
 
+def _row(name: str) -> list[str]:
+    """The cells of a kind in the table of interfaces."""
+    page = (DOCS / "reference/interfaces.md").read_text()
+    return next(row for row in page.splitlines() if row.startswith(f"| `{name}`")).split("|")[1:-1]
+
+
+def _misplaced(interface: type) -> list[str]:
+    """The methods of an interface that its row does not list where they belong."""
+    own = [key for key, value in vars(interface).items() if inspect.isfunction(value) and not key.startswith("_")]
+    abstract = getattr(interface, "__abstractmethods__", ())
+    must, might = (re.findall(r"`(\w+)`", cell) for cell in _row(interface.__name__)[1:3])
+    return [
+        *set(must) ^ {key for key in own if key in abstract},
+        *set(might) ^ {key for key in own if key not in abstract},
+    ]
+
+
 @pytest.mark.parametrize(
     "name",
-    ["Hardware", "SimulatedHardware", "Sensor", "Teleop", "Policy", "Executor", "Transport",
-     "Recorder", "Viewer"],
+    ["Hardware", "SimulatedHardware", "Sensor", "Teleop", "Policy", "Engine", "Executor", "Guard", "Transport",
+     "Recorder", "EpisodeReader", "Viewer"],
 )  # fmt: skip
 def test_every_method_is_listed_where_it_belongs(name: str) -> None:
-    interface = getattr(interfaces, name, None) or getattr(api, name)
-    own = [key for key, value in vars(interface).items() if inspect.isfunction(value) and not key.startswith("_")]
-    row = next(r for r in (DOCS / "reference/interfaces.md").read_text().splitlines() if r.startswith(f"| `{name}`"))
-    must, might = (re.findall(r"`(\w+)`", cell) for cell in row.split("|")[2:4])
-    assert must == [key for key in own if key in interface.__abstractmethods__]
-    assert might == [key for key in own if key not in interface.__abstractmethods__]
+    interface = vars(interfaces).get(name) or vars(guard).get(name) or Late(f"ibrobot_core.api:{name}").load()
+    assert _misplaced(interface) == []
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    "place",
+    ["ibrobot_mujoco.scene:Scene", "ibrobot_planning.planner:Planner", "ibrobot_provenance.datasets:DatasetWriter",
+     "ibrobot_provenance.jobs:Pool", "ibrobot_diagnose.cause:Cause"],
+)  # fmt: skip
+def test_every_method_of_kinds_of_plugins_is_listed_where_it_belongs(place: str) -> None:
+    assert _misplaced(Late(place).load()) == []
+
+
+def test_every_row_says_what_the_base_does() -> None:
+    page = (DOCS / "reference/interfaces.md").read_text()
+    rows = [row for row in page.splitlines() if row.startswith("| `")]
+    assert len(rows) >= 17
+    assert [row for row in rows if row.count("|") != 5 or not row.split("|")[4].strip()] == []
 
 
 def test_every_suite_is_in_the_guide() -> None:

@@ -81,9 +81,10 @@ export function timeAt(canvas, event, begin, end) {
   return begin + Math.min(1, Math.max(0, share)) * (end - begin);
 }
 
-// Values of a kind are plotted together: position.shoulder_pan is one of position, latency_p50_ms one of latency.
+// Values of a kind are plotted together: position.shoulder_pan is one of position, wrench.force.x one of wrench.force,
+// latency_p50_ms one of latency. So numbers of different units do not share an axis.
 export function kindOf(name) {
-  return /^[^.[]+(?=[.[])/.exec(name)?.[0] ?? /^(lateness|latency)(?=_)/.exec(name)?.[0] ?? "values";
+  return /^.+(?=\.[^.[]+$)|^[^[]+(?=\[)/.exec(name)?.[0] ?? /^(lateness|latency)(?=_)/.exec(name)?.[0] ?? "values";
 }
 
 // The name of a value among those of its kind: shoulder_pan of position.shoulder_pan.
