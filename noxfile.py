@@ -311,6 +311,16 @@ def kit(session: nox.Session) -> None:
 
 
 @nox.session(default=False)
+def mutants(session: nox.Session) -> None:
+    """Mutants of what `ibrobot plugins new` writes for each kind, or `-- KIND …`: which do the tests let pass, and why?"""
+    owners = ("testing", "planning", "mujoco", "diagnose", "provenance", "terminal", "ros2")
+    install(session, *owners, options=("mutmut>=3.8,<4",))
+    folder = Path(session.create_tmp()).absolute()
+    os.nice(19)  # it has time
+    session.run("python", "tests/house/mutants.py", str(folder), *session.posargs)
+
+
+@nox.session(default=False)
 def release(session: nox.Session) -> None:
     """A version from its number to checked wheels: `-- X.Y.Z`. Uploads nothing; CONTRIBUTING.md says what follows."""
     session.install("towncrier", "twine")

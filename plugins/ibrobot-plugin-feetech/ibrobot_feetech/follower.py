@@ -104,7 +104,7 @@ class FeetechFollower(Hardware):
         self._velocity: Vector = np.zeros(size)
         self._counts = {"lost_replies": 0, "implausible_positions": 0}
         self._again_s = _AGAIN * seconds(ctx.period_ns)
-        self._fault: HardwareError | None = None
+        self._fault: HardwareError | None = HardwareError(f"{ctx.name}: not connected")
         self._relaxed = self._holding = False
         self._resetting = False
         """Whether the last reset failed, which may have left servos without torque."""

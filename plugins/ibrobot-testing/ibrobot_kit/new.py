@@ -218,8 +218,8 @@ def _home(name: str) -> str:
 
 
 def _compatible(package: str) -> str:
-    """A requirement of a package of ibrobot that permits what is compatible with the installed version."""
-    major, minor = version(package).split(".")[:2]
+    """A requirement of a package of ibrobot that permits what is compatible with core: all have its version."""
+    major, minor = version("ibrobot-core").split(".")[:2]
     return f"{package}>={major}.{minor},<{major}.{int(minor) + 1}"
 
 

@@ -273,7 +273,12 @@ class HardwareSuite(Suite[Hardware]):
             assert np.isfinite(hardware.read().position).all()
 
     def test_refuses_use_while_disconnected(self) -> None:
-        """`read` and `write` raise HardwareError after `disconnect`, instead of repeating old values."""
+        """`read` and `write` raise HardwareError before `connect` and after `disconnect`: there are no values."""
+        fresh = self.make(self.context())
+        with pytest.raises(HardwareError):
+            fresh.read()
+        with pytest.raises(HardwareError):
+            fresh.write(np.zeros(len(fresh.joints)))
         with self.connected() as (hardware, _):
             position = hardware.read().position
         with pytest.raises(HardwareError):

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager
 from typing import Any, ClassVar
 
+import attrs
 import numpy as np
 import pytest
 
@@ -46,10 +47,12 @@ class SensorSuite(Suite[Sensor]):
         assert MESSAGE_TYPES.get(sensor.message_type.ros_type) is sensor.message_type
 
     def test_messages_are_of_the_declared_type(self) -> None:
-        """Every message is a `message_type`."""
+        """Every message is a `message_type`, and all of its fields have a value: codecs and bags take no None."""
         with self.opened() as (sensor, ctx):
             for _ in range(3):
-                assert type(self._next(sensor, ctx)) is sensor.message_type
+                message = self._next(sensor, ctx)
+                assert type(message) is sensor.message_type
+                assert not (empty := _empty(message)), f"{', '.join(empty)} of the message is None"
 
     def test_stamps_strictly_increase(self) -> None:
         """Stamps increase with each message and are not in the future."""
@@ -137,11 +140,23 @@ class SensorSuite(Suite[Sensor]):
             self._next(sensor, ctx)
 
     def test_refuses_reading_while_closed(self) -> None:
-        """`read` raises SensorError after `close`."""
+        """`read` raises SensorError before `open` and after `close`."""
+        with pytest.raises(SensorError):
+            self.make(self.context()).read(0.01)
         with self.opened() as (sensor, _):
             pass
         with pytest.raises(SensorError):
             sensor.read(0.01)
+
+
+def _empty(value: Any, path: str = "") -> list[str]:
+    """The paths of a message at which there is None."""
+    if value is None:
+        return [path]
+    if not attrs.has(type(value)):
+        return []
+    fields = ((each.name, getattr(value, each.name)) for each in attrs.fields(type(value)))
+    return [place for name, inner in fields for place in _empty(inner, f"{path}.{name}" if path else name)]
 
 
 def _decoded(message: Message) -> Message:

@@ -57,10 +57,16 @@ class ViewerSuite(Suite[Viewer]):
             assert self.shown(viewer) == self.message(ctx, 999)
 
     def test_passes_over_unknown_topics(self) -> None:
-        """Unknown topics are ignored."""
+        """Unknown topics are ignored, alone and after known ones."""
         with self.opened() as (viewer, _, bus):
             bus.publish("/unheard_of", String("hello"))
             assert viewer.update() is True
+        with self.opened() as (viewer, ctx, bus):
+            message = self.message(ctx, 1)
+            bus.publish(self.topic, message)
+            bus.publish("/unheard_of", String("hello"))
+            assert viewer.update() is True
+            assert self.shown(viewer) == message, "a message of another topic took its place"
 
     def test_says_where_to_look(self) -> None:
         """`where` is text, before and after `open`."""

@@ -170,6 +170,12 @@ class ReadsWhileDisconnected(Device):
         pass
 
 
+class ReadsBeforeItIsConnected(Device):
+    def __init__(self, ctx):
+        super().__init__(ctx)
+        self._open = True
+
+
 class StaysRelaxed(Device):
     def write(self, position):
         relaxed = self.relaxed
@@ -455,6 +461,7 @@ WRONG = {
     KeepsTheCommand: "keeps_no_hold_of_the_callers_arrays",
     ReusesItsReading: "keeps_no_hold_of_the_callers_arrays",
     DisconnectsOnce: "disconnect_is_safe_at_any_time",
+    ReadsBeforeItIsConnected: "refuses_use_while_disconnected",
     ReadsWhileDisconnected: "refuses_use_while_disconnected",
     StaysRelaxed: "relax_ends_with_the_next_write",
     RelaxReportsNothing: "relax_reports_torque_and_what_holds_it",

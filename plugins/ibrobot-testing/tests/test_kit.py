@@ -93,6 +93,11 @@ def test_package_has_the_licence_of_ibrobot() -> None:
     assert (project["license"], project["license-files"]) == ("Apache-2.0", ["LICENSE"])
 
 
+def test_package_that_only_the_tests_need_need_not_be_installed() -> None:
+    project = tomllib.loads(render("recorder", "my_recorder")["pyproject.toml"])["project"]
+    assert "ibrobot-plugin-data>=0.1,<0.2" in project["optional-dependencies"]["test"]
+
+
 @pytest.mark.parametrize("name", ["", "My_arm", "my-arm", "1st", "my arm", "../up", "ärm"])
 def test_name_that_no_module_can_have_is_an_error(tmp_path: Path, name: str) -> None:
     with pytest.raises(RequestError, match=r"NAME is .*: use lower-case letters, digits and _, e.g. my_arm"):

@@ -40,6 +40,18 @@ class OtherType(FakeSensor):
     message_type = CompressedImage
 
 
+class NamesNoFrame(FakeSensor):
+    def read(self, timeout_s):
+        image = super().read(timeout_s)
+        return image and attrs.evolve(image, header=attrs.evolve(image.header, frame_id=None))
+
+
+class ReadsBeforeItIsOpen(FakeSensor):
+    def __init__(self, ctx):
+        super().__init__(ctx)
+        self._open = True
+
+
 class StampsStandStill(FakeSensor):
     def read(self, timeout_s):
         image = super().read(timeout_s)
@@ -130,6 +142,8 @@ class ReadsWhileClosed(FakeSensor):
 WRONG = {
     RelativeTopic: "topic_and_type_are_declared",
     OtherType: "messages_are_of_the_declared_type",
+    NamesNoFrame: "messages_are_of_the_declared_type",
+    ReadsBeforeItIsOpen: "refuses_reading_while_closed",
     StampsStandStill: "stamps_strictly_increase",
     StampsAhead: "stamps_strictly_increase",
     StampsOnReading: "stamps_are_times_of_capture",

@@ -59,6 +59,11 @@ class WantsJointStates(FakeViewer):
         return super().update()
 
 
+class ShowsAnyTopic(FakeViewer):
+    def open(self):
+        self._subscription = self._bus.subscribe(None, depth=1)
+
+
 class NowhereToLook(FakeViewer):
     def where(self):
         return None
@@ -80,6 +85,7 @@ WRONG = {
     NeverCloses: "stays_open_until_the_person_closes_it",
     ClosesWithoutMessages: "stays_open_until_the_person_closes_it",
     ShowsTheOldest: "shows_the_newest",
+    ShowsAnyTopic: "passes_over_unknown_topics",
     WantsJointStates: "passes_over_unknown_topics",
     NowhereToLook: "says_where_to_look",
     StaysOnTheBus: "leaves_the_bus_when_closed",
