@@ -83,7 +83,7 @@ def test_its_own_checks_find_nothing(embodiment: RobotEmbodiment) -> None:
     assert registered("embodiment")["ibrobot"] is RobotEmbodiment
 
 
-def test_policies_are_told_apart_by_ground_truth(embodiment: RobotEmbodiment, tmp_path: Path) -> None:
+def test_ground_truth_distinguishes_policies(embodiment: RobotEmbodiment, tmp_path: Path) -> None:
     assert evaluated(embodiment, Scripted(embodiment), tmp_path, SCENES, 600) == [1.0, 1.0]
     assert evaluated(embodiment, Scripted(embodiment, moves=False), tmp_path, SCENES[:1], 20) == [0.0]
 
