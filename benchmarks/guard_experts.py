@@ -51,7 +51,7 @@ def run(mode: str, settings: tuple[str, ...], episodes: int, seed: int, policy: 
     command += [part for change in changes for part in ("--set", change)]
     environment = os.environ | ({} if policy is None else {"IBROBOT_POLICY": str(policy)})
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    successes = re.findall(r"^I episode \d+: (\w+)", done.stderr + done.stdout, re.MULTILINE)
+    successes = re.findall(r"^I episode \d+: (success|failure)$", done.stderr + done.stdout, re.MULTILINE)
     ticks = re.search(r"(\d+) ticks in lockstep", done.stdout)
     if ticks is None or len(successes) != episodes:
         raise SystemExit(f"{' '.join(command)} has failed:\n{done.stdout}{done.stderr}")

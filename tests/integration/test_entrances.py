@@ -24,6 +24,8 @@ from ibrobot_planning.world.collision import Collisions
 from ibrobot_planning.world.objects import observed_world
 from ibrobot_testing.site import made_up_site
 
+from ibrobot_core.control.commands import GetCounters
+
 pytestmark = pytest.mark.integration
 
 ROOT = Path(__file__).parents[2]
@@ -371,5 +373,36 @@ def test_effort_that_is_not_finite_is_refused_by_name(
         run.ticks(40)
         assert run.moved(begun) < _STILL_RAD
         assert f"INVALID_GOAL: max_effort must be a finite number, got {value!r}" in caplog.text
+    finally:
+        entrance.close()
+
+
+@pytest.mark.usefixtures("parts")
+def test_the_hand_of_another_run_on_the_same_table_is_avoided() -> None:
+    """The other run sends at each tick where its hand is; two ticks later the guard knows it."""
+    entrance = entrances.Policy()
+    try:
+        run = entrance.launch(
+            "world.objects={other: {shape: box, size: [0.06, 0.06, 0.08], position: [0.1, -0.6, 0.06]}}"
+        )
+        entrance.prepare()
+        session = run.session
+
+        def place(y: float) -> None:
+            session.bus.call("/world/move", {"name": "other", "position": [0.1, y, 0.06]})
+
+        def known() -> int:
+            return int(session.control.call(GetCounters())["guard"]["world_changes"])
+
+        for y in np.linspace(-0.5, -0.16, 30).tolist():
+            before = known()
+            run.ticks(1, lambda y=y: place(y))
+            run.ticks(1)
+            assert known() == before + 1
+        run.ticks(200, entrance.ask)
+        assert max(command[entrance.column] for command in run.commands) < FAR - 0.01
+        place(-0.6)
+        run.ticks(150, entrance.ask)
+        assert run.commands[-1][entrance.column] > FAR, "the way is free once the other hand is gone"
     finally:
         entrance.close()

@@ -5,8 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import guard_trials
+import numpy as np
 import pytest
 from guard_trials import Judge, Station
+from ibrobot_planning.guard.changes import WorldChange
+from ibrobot_planning.world.objects import Box, WorldObject
+
+from ibrobot_core.api import Pose, Vector3
+from ibrobot_core.control.commands import ClearFaults
 
 pytestmark = pytest.mark.integration
 
@@ -28,3 +34,31 @@ def test_no_command_leads_into_contact(judged) -> None:
 def test_an_operator_gets_out(judged) -> None:
     station, judge = judged
     assert guard_trials.backs_out(station, judge, 0) == ""
+
+
+def test_while_the_host_is_silent_the_world_stays_known_and_then_the_arm_rests(judged) -> None:
+    """As a run's process that hangs: no world, no plan and no state comes; control goes on."""
+    station, _ = judged
+    loop = guard_trials.ControlLoop(station)
+    core = loop._control._core
+    loop.world(WorldChange({"wall": WorldObject(Box((0.6, 0.02, 0.4)), Pose(Vector3(0.2, -0.15, 0.2)))}))
+    goal = loop.position.copy()
+    goal[0] = 1.5
+    moved = [loop.tick(goal)[0] for _ in range(20)]
+    assert moved[-1] > 0.1
+    silent_s, ticks = 0.0, 0
+    while not core.fault and ticks < 100:
+        loop.tick(goal)  # an executor may have a plan that goes on
+        silent_s, ticks = silent_s + 0.01, ticks + 1
+        core.note_silence(silent_s, "the host has been silent")
+    assert core.fault.startswith("the host has been silent")
+    assert ticks <= 30, "peer_timeout is 0.3 s"
+    for _ in range(20):
+        loop.tick(goal)
+    before = loop.position
+    assert np.array_equal(loop.tick(goal), before), "it rests until a reset"
+    core.handle(ClearFaults())
+    loop._generation = core.generation
+    at = [loop.tick(goal)[0] for _ in range(150)]
+    loop.close()
+    assert at[-1] < 1.2, "the wall is still known"
