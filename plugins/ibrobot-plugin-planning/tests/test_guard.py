@@ -668,6 +668,15 @@ def test_a_world_that_is_deleted_in_motion_and_comes_back(tmp_path, at: int, del
     assert nearest > min(room, MARGIN_M) - 0.001
 
 
+def test_an_object_that_comes_into_the_way_is_braked_for(tmp_path) -> None:
+    """It was far: what was known of its distance does not count any more."""
+    loop = Loop(tmp_path, LEFT)
+    loop.world({"wall": box(0.35, -9.0, 0.15, 0.4, 0.02, 0.3)})
+    loop.go(LEFT, 20)
+    loop.world(WALL)
+    assert 0.0 < loop.go(ACROSS)[0] < LEFT[0] - 0.3
+
+
 def test_an_object_that_moves_is_where_it_is_and_not_where_it_was(tmp_path) -> None:
     loop = Loop(tmp_path, LEFT)
     loop.world(WALL)
