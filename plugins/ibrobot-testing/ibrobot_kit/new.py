@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import keyword
 import re
 import shlex
 import shutil
@@ -11,6 +12,7 @@ import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from importlib import import_module
 from importlib.metadata import distribution, version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +53,11 @@ class NewPlugin:
 
     def __call__(self) -> dict[str, Any]:
         """Write it, completely or not at all."""
-        if not re.fullmatch(r"[a-z][a-z0-9_]*", self.name):
+        if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", self.name):
             raise RequestError(f"NAME is {self.name!r}: use lower-case letters, digits and _, e.g. my_arm")
+        if keyword.iskeyword(self.name) or find_spec(f"ibrobot_{self.name}") is not None:
+            taken = "a word of Python" if keyword.iskeyword(self.name) else f"ibrobot_{self.name}, which is installed"
+            raise RequestError(f"NAME is {self.name!r}: that is {taken}; choose another")
         folder = self.out / f"ibrobot-plugin-{self.name.replace('_', '-')}"
         if self.out.exists() and not self.out.is_dir():
             raise RequestError(f"--out {self.out}: is not a folder")
@@ -106,6 +111,10 @@ def render(kind: str, name: str, *, outside: bool = True) -> dict[str, str]:
     module = import_module(source)
     title = "".join(word.capitalize() for word in name.split("_"))
     imports, body = excerpt(module, begun)
+    if {title, name} & {line.split()[-1] for line in imports}:
+        raise RequestError(
+            f"NAME is {name!r}, which the package needs for something else; choose another, e.g. my_{name}"
+        )
     made = getattr(module, begun)
     new = title if isinstance(made, type) else name
     options = [*_options(made)]

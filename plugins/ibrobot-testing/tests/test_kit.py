@@ -98,10 +98,28 @@ def test_package_that_only_the_tests_need_need_not_be_installed() -> None:
     assert "ibrobot-plugin-data>=0.1,<0.2" in project["optional-dependencies"]["test"]
 
 
-@pytest.mark.parametrize("name", ["", "My_arm", "my-arm", "1st", "my arm", "../up", "ärm"])
+@pytest.mark.parametrize("name", ["", "My_arm", "my-arm", "1st", "my arm", "../up", "ärm", "x_", "a__b"])
 def test_name_that_no_module_can_have_is_an_error(tmp_path: Path, name: str) -> None:
     with pytest.raises(RequestError, match=r"NAME is .*: use lower-case letters, digits and _, e.g. my_arm"):
         NewPlugin("teleop", name, tmp_path)()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["class", "core", "testing"])
+def test_name_that_is_taken_is_an_error(tmp_path: Path, name: str) -> None:
+    with pytest.raises(
+        RequestError, match=r"that is (a word of Python|ibrobot_\w+, which is installed); choose another"
+    ):
+        NewPlugin("teleop", name, tmp_path)()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("kind", "name"), [("executor", "plan"), ("executor", "executor"), ("policy", "frame")])
+def test_name_that_the_package_itself_needs_is_an_error(tmp_path: Path, kind: str, name: str) -> None:
+    with pytest.raises(
+        RequestError, match=f"which the package needs for something else; choose another, e.g. my_{name}"
+    ):
+        NewPlugin(kind, name, tmp_path)()
     assert list(tmp_path.iterdir()) == []
 
 
