@@ -293,6 +293,10 @@ class Session:
         """Set up the simulated scene again; False if an emergency stop is latched, so that nothing has changed."""
         return bool(self.command(commands.ResetEpisode(seed))["begun"])
 
+    def end_episode(self, outcome: str) -> None:
+        """End the present episode, if any, as `Episodes.end`; a source that knows how it went calls it."""
+        self.episodes.end(outcome)
+
     @property
     def stops(self) -> int:
         """Number of emergency stops in this run, as far as known here; see `ControlState.stops`."""

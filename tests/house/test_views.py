@@ -24,7 +24,7 @@ MAY_MOVE = {
     "StreamingRun": {
         "ibrobot_gym/environment.py",
         "ibrobot_lerobot_program/run.py",
-        "ibrobot_testing/fakes/host.py",
+        *(f"ibrobot_testing/fakes/{name}.py" for name in ("host", "run")),
         *(f"ibrobot_data/{name}.py" for name in ("corrections", "handover", "replay_source")),
     },
     "GoalRun": {
@@ -37,7 +37,7 @@ MAY_MOVE = {
 }
 """View that moves the robot -> the files that take it. A new file here is a new entrance to motion; see SENDERS."""
 MOVES = {
-    "StreamingRun": {"send_plan", "reset_episode", "raise_fault", "pass_on", "devices"},
+    "StreamingRun": {"send_plan", "reset_episode", "end_episode", "raise_fault", "pass_on", "devices"},
     "GoalRun": {"send_goal", "cancel_goals"},
     "GuardedRun": {"send_goal", "cancel_goals", "goal_door"},
     "RecordedRun": {"operator_events", "begin_source", "end_source", "add_fault", "emit"},

@@ -129,7 +129,7 @@ class ReplaySource(SourceWorker):
             return
         self.active = False
         if self._success is not None and self._playback.outcome == "success":
-            session.episodes.end("success" if self._success else "failure")
+            session.end_episode("success" if self._success else "failure")
         session.finish()
 
     @override
