@@ -186,7 +186,8 @@ def list_what_was_not_tested() -> None:
 def installation(page: str) -> list[str]:
     """What the first `$ pip install` of a page's console blocks installs, and the commands after it in that block."""
     text = Path(page).read_text(encoding="utf-8")
-    block = re.search(r"^```console\n\$ pip install (?:--find-links dist )?\"?(ibrobot\S*?)\"?\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    begins = r"^```console\n\$ pip install (?:--find-links dist )?\"?(ibrobot\S*?)\"?\n(.*?)^```"
+    block = re.search(begins, text, re.MULTILINE | re.DOTALL)
     if block is None:
         raise ValueError(f"{page}: no console block begins with `$ pip install ibrobot…`")
     return [block[1], *re.findall(r"^\$ (.*)$", block[2], re.MULTILINE)]
@@ -312,7 +313,7 @@ def kit(session: nox.Session) -> None:
 
 @nox.session(default=False)
 def mutants(session: nox.Session) -> None:
-    """Mutants of what `ibrobot plugins new` writes for each kind, or `-- KIND …`: which do the tests let pass, and why?"""
+    """Mutants of what `ibrobot plugins new` writes, of all kinds or `-- KIND …`: which do tests let pass, and why?"""
     owners = ("testing", "planning", "mujoco", "diagnose", "provenance", "terminal", "ros2")
     install(session, *owners, options=("mutmut>=3.8,<4",))
     folder = Path(session.create_tmp()).absolute()
