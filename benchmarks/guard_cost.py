@@ -89,7 +89,7 @@ def check_times(
 
 def checks(ticks: int) -> dict[str, float]:
     """The table of the documentation, printed."""
-    rng, figures = np.random.default_rng(1), {}
+    rng, figures = np.random.default_rng(1), dict[str, float]()
     with tempfile.TemporaryDirectory() as folder:
         station = guard_trials.stations(Path(folder))["so101"]
         judge = Judge(station)

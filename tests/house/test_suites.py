@@ -6,6 +6,7 @@ import ast
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
+from typing import TypeGuard
 
 PLUGINS = Path(__file__).parents[2] / "plugins"
 
@@ -62,7 +63,7 @@ def compared() -> Iterator[str]:
                     todo += own[name][2] if name in own else []
 
 
-def is_checks(node: ast.AST) -> bool:
+def is_checks(node: ast.AST) -> TypeGuard[ast.Call]:
     return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "checks"
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from ibrobot_core.api import pixels
+from ibrobot_core.api import Image, pixels
 from ibrobot_core.bus import Bus
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Frame, Policy
@@ -237,12 +237,16 @@ def test_an_act_says_what_it_attends_to_and_acts_as_before(folders: dict[str, Pa
         }  # fmt: skip
         assert 0.1 < sum(float(weights.sum()) for weights in looks.values()) < 1.0
         for name, weights in looks.items():
-            np.testing.assert_allclose(together[name], weights, atol=TOLERANCE)
+            np.testing.assert_allclose(floats(together[name]), floats(weights), atol=TOLERANCE)
         attention = policy._model._attention  # type: ignore[union-attr]
         attention.take = lambda: [{}]  # type: ignore[method-assign, union-attr]
         np.testing.assert_array_equal(policy.infer(tensors)["action"], alone["action"])
         del attention.take  # type: ignore[union-attr]
     assert set(loaded(folders["diffusion"]).infer(batch_of(folders["diffusion"]))) == {"action"}
+
+
+def floats(tensor: NDArray[np.generic]) -> NDArray[np.float32]:
+    return np.asarray(tensor, np.float32)
 
 
 def batch_of(path: Path) -> dict[str, Any]:
@@ -265,10 +269,11 @@ def test_what_an_act_attends_to_is_published_with_its_answer(folders: dict[str, 
         assert bus.topics() == {}
         return
     [received] = arrived.drain()
+    assert isinstance(received.message, Image)
     shown = pixels(received.message)[..., 0]
-    weights = outputs[f"attention.{TOP}"]
+    weights = floats(outputs[f"attention.{TOP}"])
     assert shown.max() == 255
-    np.testing.assert_allclose(shown, 255 * weights / weights.max(), atol=1.0)
+    np.testing.assert_allclose(shown.astype(np.float32), 255 * weights / weights.max(), atol=1.0)
 
 
 def test_fewer_actions_on_demand(folders: dict[str, Path]) -> None:

@@ -23,7 +23,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 """The frame of the options, y up and z out of the tag, in that of the library, y down and z into it."""
 
 
-class _Library(Apriltags):
+class _Library(Apriltags):  # type: ignore[misc]  # the library brings no types
     """The library for one family of tags, which the process keeps: its own end frees memory that it then reads."""
 
     def __del__(self) -> None:

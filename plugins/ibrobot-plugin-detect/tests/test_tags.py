@@ -38,8 +38,8 @@ def seen_from_above() -> Sight:
     return photograph(camera(ABOVE), PLACED)
 
 
-def detector(tags: Mapping[str, Tag], **more: float) -> TagDetector:
-    return TagDetector(TagOptions(dict(tags), **more), make_session())
+def detector(tags: Mapping[str, Tag], margin: float = 30.0) -> TagDetector:
+    return TagDetector(TagOptions(dict(tags), margin=margin), make_session())
 
 
 class TestTagDetector(DetectorSuite):
@@ -65,7 +65,8 @@ def errors(distortion: NDArray[np.float64] | None, count: int) -> NDArray[np.flo
     for _ in range(count):
         far = rng.uniform(0.2, 0.7)
         place = (far * rng.uniform(-0.3, 0.3), far * rng.uniform(-0.2, 0.2), far)
-        truth = facing(*rng.uniform(-0.9, 0.9, 2), rng.uniform(-np.pi, np.pi), place)
+        tilt, turn = rng.uniform(-0.9, 0.9, 2)
+        truth = facing(tilt, turn, rng.uniform(-np.pi, np.pi), place)
         detections = looked.find("", [photograph(camera(np.eye(4), distortion), {3: (truth, 0.04)})])
         assert len(detections) == 1, f"the tag at {place} is not found"
         there = matrix(detections[0].pose)

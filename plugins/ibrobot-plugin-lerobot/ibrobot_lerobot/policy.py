@@ -196,8 +196,9 @@ class LeRobotPolicy(Policy):
             return
         for name, weights in tensors.items():
             if name.startswith(ATTENTION):
-                height, width = weights.shape
-                pixels = (255 * weights / max(float(weights.max()), 1e-12)).astype(np.uint8).ravel()
+                shares = np.asarray(weights, np.float32)
+                height, width = shares.shape
+                pixels = (255 * shares / max(float(shares.max()), 1e-12)).astype(np.uint8).ravel()
                 shown = Image(Header(self._ctx.clock.now_ns()), height, width, "mono8", width, pixels)
                 bus.publish(f"/attention/{name.rpartition('.')[2]}", shown)
 

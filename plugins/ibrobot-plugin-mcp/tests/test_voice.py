@@ -24,7 +24,7 @@ def talker() -> Any:
 @pytest.mark.parametrize("granted", [True, False], ids=["granted", "not granted"])
 def test_what_is_heard_is_done_within_what_is_granted(rig: Rig, granted: bool) -> None:
     sentences = iter(["Where is it?", "Move there and back.", "Stop!", ""])
-    calls = {
+    calls: dict[str, list[tuple[str, Any]]] = {
         "Where is it?": [("test_state", {})],
         "Move there and back.": [("test_move", {"to": 0.5}), ("test_move", {"to": -0.5})],
         "Stop!": [("stop", {})],

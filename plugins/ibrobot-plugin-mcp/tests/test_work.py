@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast, override
@@ -256,8 +256,9 @@ def test_options_are_those_of_the_command() -> None:
     some = some_options(Look, "count")
     assert issubclass(some, Options)
     assert [each.alias for each in attrs.fields(some)] == ["count"]
+    make: Callable[..., Options] = some
     with pytest.raises(ValueError, match="too large"):
-        some(count=10)
+        make(count=10)
 
 
 def test_a_report_that_cannot_be_read_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -55,7 +55,7 @@ def moves(seconds: float, seed: int = 0, reach: float = 0.45) -> Vector:
     columns = []
     for joint in range(6):
         middle = MIDDLE[joint]
-        here, row = 0.0, []
+        here, row = 0.0, list[float]()
         while len(row) < count:
             is_small = rng.random() < 0.35
             there = here + rng.choice((-1, 1)) * 0.05 if is_small else middle + rng.uniform(-reach, reach)

@@ -43,7 +43,10 @@ class OtherType(FakeSensor):
 class NamesNoFrame(FakeSensor):
     def read(self, timeout_s):
         image = super().read(timeout_s)
-        return image and attrs.evolve(image, header=attrs.evolve(image.header, frame_id=None))
+        if image is None:
+            return None
+        header = attrs.evolve(image.header, frame_id=None)  # type: ignore[arg-type]
+        return attrs.evolve(image, header=header)
 
 
 class ReadsBeforeItIsOpen(FakeSensor):

@@ -114,7 +114,7 @@ class FedArm:
         count = int(np.ceil(recording.seconds / self._step_s)) + 2
         first_s = float(recording.command_times[0])
         before = max(0, int(np.ceil(-first_s / self._step_s)))
-        times: Vector = (np.arange(count + before) - before) * self._step_s
+        times = np.arange(-before, count, dtype=np.float64) * self._step_s
         if recording not in self._limited:
             newest = np.searchsorted(recording.command_times, times + 1e-9, side="right") - 1
             held = recording.commands[np.maximum(newest, 0)]
