@@ -19,7 +19,7 @@ pytestmark = pytest.mark.integration
 
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted([*ROOT.glob("ibrobot_core/**/*.py"), *ROOT.glob("plugins/*/*ibrobot*/**/*.py")])
-FOREIGN = OF_OTHERS | {"--upgrade", "--reload", "--no-deps", "--version", "--help", "--user"}
+FOREIGN = OF_OTHERS | {"--upgrade", "--reload", "--no-deps", "--version", "--help", "--user", "--task", "--embodiment"}
 """Options of other programs, e.g. pip, and those that each command has."""
 KNOWN = tuple(cli.list_commands(click.Context(cli)))
 FIRST_HOUR = {
@@ -40,6 +40,8 @@ REMEDIES = {
     "test_a_drafted_contract_converts_the_bag_that_it_is_from",
     "ibrobot convert X --config X --out DATASET": "tests/integration/test_contract_alone.py::"
     "test_a_drafted_contract_converts_the_bag_that_it_is_from",
+    "ibrobot identify --excite ROBOT": "tests/integration/test_identify.py::"
+    "test_excitation_moves_each_joint_and_is_recorded",
     "ibrobot datasets merge DATASET --out NEW": f"{_LEROBOT}/test_versions.py::"
     "test_every_version_becomes_the_current_one_by_merging",
     "ibrobot datasets merge X --out X-v3": f"{_LEROBOT}/test_versions.py::"

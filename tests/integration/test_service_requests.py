@@ -19,7 +19,7 @@ from ibrobot_core.api import FollowTrajectory
 from ibrobot_core.errors import IbrobotError, TransportError
 from ibrobot_core.launch.runtime import Runtime
 
-REQUESTS = 120
+REQUESTS = 180
 WAITING = ("/moveit_gateway/move_to_pose", "/moveit_gateway/move_to_configuration")
 """They answer when the motion has ended, for which a run in lockstep would have to be stepped."""
 BRAKING_TICKS = 30

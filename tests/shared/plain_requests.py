@@ -43,6 +43,7 @@ EVERYTHING = (
     "world={scene: true, clouds: {camera: {topic: /camera/points, when_stale: forget}}}",
     "tasks={}",
     "mcp={http: false}",
+    "detect={use: {scene: {}}}",
     "recording={type: mcap, root: episodes}",
     "episodes={keep: highlights}",
     "teleoperation={web: {type: web}, twist: {type: twist}}",

@@ -9,6 +9,7 @@ from typing import ClassVar
 import attrs
 import numpy as np
 from ibrobot_kinematics.poses import matrix
+from ibrobot_kinematics.rotations import log
 from ibrobot_testing.suite import Suite
 
 from ibrobot_core.api import Pose
@@ -45,8 +46,7 @@ class DetectorSuite(Suite[Detector]):
             truth, there = matrix(self.objects()[each.name]), matrix(each.pose)
             away_m = float(np.linalg.norm(truth[:3, 3] - there[:3, 3]))
             assert away_m <= self.tolerance_m, f"{each.name} is found {away_m * 1000:.1f} mm from where it is"
-            cosine = (np.trace(truth[:3, :3].T @ there[:3, :3]) - 1) / 2
-            turned = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+            turned = float(np.linalg.norm(log(truth[:3, :3].T @ there[:3, :3])))
             assert turned <= self.tolerance_rad, f"{each.name} is found turned by {np.degrees(turned):.1f} degrees"
 
     def test_a_name_chooses(self) -> None:

@@ -10,12 +10,19 @@ from typing import Any, override
 import numpy as np
 from ibrobot_kinematics.poses import homogeneous, matrix, pose, pose_at
 from numpy.typing import NDArray
-from pupil_apriltags import Detector as Apriltags
 
-from ibrobot_core.api import SensorError, Vector
-from ibrobot_core.app import RunView
+from ibrobot_core.api import MissingDependency, SensorError, Vector
+from ibrobot_core.app import RunView, install_command
 from ibrobot_detect.detector import Detection, Detector, Seen, Sight, box_of, fits
 from ibrobot_detect.options import Tag, TagOptions
+
+try:
+    from pupil_apriltags import Detector as Apriltags
+except ModuleNotFoundError:  # there are no wheels for some processors
+    raise MissingDependency(
+        "the Python package pupil-apriltags is not installed",
+        remedy=f"{install_command(['pupil-apriltags'])} compiles it",
+    ) from None
 
 _SURE = 100.0
 """Contrast of a tag's cells from which the detector is sure."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +15,19 @@ from .conftest import Rig
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "talk-to-a-robot.md"
 
 
-def talker() -> Any:
+def talker(folder: Path) -> Any:
     (code, *_) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
-    defined: dict[str, Any] = {}
-    exec(compile(code, str(PAGE), "exec"), defined)  # noqa: S102 - what the page shows
-    return defined["talk"]
+    (folder / "talk.py").write_text(code, encoding="utf-8")
+    spec = spec_from_file_location("talk", folder / "talk.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.talk
 
 
 @pytest.mark.parametrize("granted", [True, False], ids=["granted", "not granted"])
-def test_what_is_heard_is_done_within_what_is_granted(rig: Rig, granted: bool) -> None:
+def test_what_is_heard_is_done_within_what_is_granted(rig: Rig, granted: bool, tmp_path: Path) -> None:
     sentences = iter(["Where is it?", "Move there and back.", "Stop!", ""])
     calls: dict[str, list[tuple[str, Any]]] = {
         "Where is it?": [("test_state", {})],
@@ -39,7 +44,7 @@ def test_what_is_heard_is_done_within_what_is_granted(rig: Rig, granted: bool) -
         await client.list_tools()
         if granted:
             rig.grant()
-        await talker()(client, lambda: next(sentences), think, said.append)
+        await talker(tmp_path)(client, lambda: next(sentences), think, said.append)
 
     rig.talk(act)
     moved = [0.5, -0.5] if granted else []

@@ -131,8 +131,10 @@ def _drifts(fitted: Fitted, last: ArmParameters) -> Iterator[Finding]:
     for each in fitted.known:
         if each.name not in (*_DRIFTS, "delay") or each.confidence == "unknown":
             continue
-        source = last if each.joint == ARM else last.joints.get(each.joint)
-        old, sigma = getattr(source, each.name, None), before.get(each.joint, {}).get(each.name)
+        if each.joint != ARM and each.joint not in last.joints:
+            continue
+        source = attrs.asdict(last if each.joint == ARM else last.joints[each.joint], recurse=False)
+        old, sigma = source[each.name], before.get(each.joint, {}).get(each.name)
         if old is None or sigma is None or f"{each.joint}.{each.name}" in last.identified.unknown:
             continue
         change = each.value - old
