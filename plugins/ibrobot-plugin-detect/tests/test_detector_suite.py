@@ -59,8 +59,8 @@ class Changed(FakeDetector):
 class Shifted(Changed):
     @override
     def change(self, each: Detection) -> Detection:
-        x, y, z = each.pose.position
-        return attrs.evolve(each, pose=pose_at((x + 0.01, y, z)))
+        there = attrs.evolve(each.pose.position, x=each.pose.position.x + 0.01)
+        return attrs.evolve(each, pose=attrs.evolve(each.pose, position=there))
 
 
 class FindsAll(FakeDetector):
