@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from numbers import Real
 from typing import TYPE_CHECKING, ClassVar, Literal, override
 
 import attrs
 
-from ibrobot_core.api import Descriptor
+from ibrobot_core.api import Descriptor, Options
 
 if TYPE_CHECKING:
     import numpy as np
@@ -37,6 +38,20 @@ ACCUSED = 0.5
 """Likelihood from which a cause is named."""
 _FAILED = 0.85
 """Likelihood from which a rig fails, for causes that state no number for it."""
+OWN_NAMES = frozenset({
+    "answers_slow", "answers_tremble", "arm_not_following", "bgr", "calibration_odd", "camera_ignored",
+    "camera_missing", "camera_moved", "camera_options", "camera_slow", "camera_unknown", "cameras_exchanged",
+    "checkpoint_early", "duplicate", "gripper_idle", "gripper_reversed", "gripper_scaled", "guard_held",
+    "idle_data", "idle_end", "idle_start", "jerk", "joint_order", "joint_zero", "joints_unwell", "leader_apart",
+    "limits_low", "loop_slow", "not_judged", "observation_late", "odd_length", "odd_path", "other_calibration",
+    "other_contract", "other_gripper", "other_model", "other_norm_mode", "other_prompt", "other_rate",
+    "other_resolution", "other_robot", "other_speed", "other_units", "other_versions", "picture_black",
+    "picture_blurred", "picture_bright", "picture_covered", "picture_dark", "picture_flipped", "picture_frozen",
+    "picture_gaps", "plan_dry", "requests_fail", "saturated", "smoothing_averages", "stall", "stands_still",
+    "statistics", "takeover", "ticks_missed", "unseen_pictures", "unseen_start", "unseen_states",
+    "unseen_success", "white_balance", "zero_shifted",
+})  # fmt: skip
+"""Names of the causes of this package, which no other can have. Discovery needs them, and imports no cause."""
 type Verdict = Literal["ok", "warn", "fail", "cannot tell"]
 
 
@@ -49,21 +64,27 @@ class Shown:
     """Shape (H, W, 3)."""
 
 
+_text = attrs.validators.instance_of(str)
+_number = attrs.validators.instance_of(Real)
+
+
 @attrs.frozen(eq=False)
 class Evidence:
-    """What a cause found."""
+    """What a cause found. A field of another type is a TypeError."""
 
-    text: str
+    text: str = attrs.field(validator=_text)
     """One sentence with the number; it begins the report if the cause is the most probable one."""
-    number: float
-    unit: str
-    threshold: float
+    number: float = attrs.field(validator=_number)
+    unit: str = attrs.field(validator=_text)
+    threshold: float = attrs.field(validator=_number)
     """The cause is accused if the number is on the wrong side of it."""
-    likelihood: float
+    likelihood: float = attrs.field(validator=_number)
     """0 to 1; from 0.5 on the cause is named."""
-    since_s: float | None = None
+    since_s: float | None = attrs.field(default=None, validator=attrs.validators.optional(_number))
     """From when on [s], since the beginning of the window; None if it applies throughout."""
-    details: tuple[str, ...] = ()
+    details: tuple[str, ...] = attrs.field(
+        default=(), validator=attrs.validators.deep_iterable(_text, attrs.validators.instance_of((tuple, list)))
+    )
     """Further evidence, a line each."""
     explains: frozenset[str] | None = None
     """In place of those of the cause, if they depend on what was found."""
@@ -167,9 +188,17 @@ class ModelCause(Cause):
 
 @attrs.frozen
 class CauseDescriptor(Descriptor[Cause]):
-    """A cause of another package."""
+    """A cause of another package. Its type is the `name` of the cause; a cause has no options."""
 
     make: Callable[[], Cause] = attrs.field(kw_only=True)  # type: ignore[assignment]
+
+    @override
+    def mistakes(self) -> Iterator[str]:
+        yield from super().mistakes()
+        if self.type in OWN_NAMES:
+            yield "ibrobot-plugin-diagnose has a cause of this name: give yours another"
+        if self.options is not Options:
+            yield "options: nothing sets options of a cause; leave them out, and make its numbers constants"
 
 
 @attrs.frozen(eq=False)
@@ -202,6 +231,8 @@ class Diagnosis:
     """Name of the causes that could not be tested, and why."""
     measured: tuple[Finding, ...] = ()
     """The evidence of healthy causes, as far as there is any."""
+    broken: tuple[tuple[str, str], ...] = ()
+    """Those of the untested that have a mistake, and the plugins that failed, which may offer causes."""
 
     @property
     def first(self) -> str:

@@ -58,6 +58,8 @@ def contents_of(facts: Mapping[str, Any]) -> list[ReportSection]:
     if facts["counts"]:
         rows = tuple((name, str(count)) for name, count in facts["counts"].items())
         sections.append(ReportSection("What was found", (Table(("cause", "episodes"), rows),)))
+    if untested := tuple((each["name"], each["why"]) for each in facts.get("untested", ())):
+        sections.append(ReportSection("Not tested", (Table(("cause", "why"), untested),)))
     if facts["unreadable"]:
         sections.append(ReportSection("Unreadable", tuple(Text(each) for each in facts["unreadable"])))
     return sections

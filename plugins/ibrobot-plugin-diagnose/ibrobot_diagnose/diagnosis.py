@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from pathlib import Path
+from traceback import extract_tb
 from typing import TYPE_CHECKING
 
-from ibrobot_core.api import IbrobotError
+import attrs
+
 from ibrobot_core.app import installed_plugins
-from ibrobot_diagnose.cause import ACCUSED, KIND, Cause, CauseDescriptor, Diagnosis, Finding, Reference
+from ibrobot_diagnose.cause import ACCUSED, KIND, Cause, CauseDescriptor, Diagnosis, Evidence, Finding, Reference
 from ibrobot_diagnose.causes import all_causes
 
 if TYPE_CHECKING:
@@ -27,20 +30,67 @@ STREAMS = frozenset({*_LACKS, "demonstration"})
 """Names of all that a cause can need."""
 
 
-def installed_causes() -> tuple[Cause, ...]:
-    """The causes of this package and of others.
+@attrs.frozen
+class Installed:
+    """The causes of this package and of others."""
 
-    Raises:
-        IbrobotError: if one has the name of another.
-    """
-    known = {each.name: each for each in all_causes()}
-    for descriptor in installed_plugins().of_kind(KIND):
+    causes: tuple[Cause, ...]
+    broken: tuple[tuple[str, str], ...]
+    """Type of the causes that cannot be used, and name of the plugins that failed: with the package and the mistake."""
+    packages: Mapping[str, str]
+    """Name of a cause -> its package."""
+
+
+def installed_causes() -> Installed:
+    """The causes of this package and of others. A mistake in one keeps the others."""
+    registry = installed_plugins()
+    causes = list(all_causes())
+    packages = dict.fromkeys((each.name for each in causes), "ibrobot-plugin-diagnose")
+    broken = [(failure.plugin, str(failure)) for failure in registry.failures]
+    for descriptor in registry.of_kind(KIND):
         assert isinstance(descriptor, CauseDescriptor)
-        cause = descriptor.make()
-        if cause.name in known:
-            raise IbrobotError(f"there is a cause {cause.name!r} already; the plugin must give its own another name")
-        known[cause.name] = cause
-    return tuple(known.values())
+        package = registry.entries[KIND, descriptor.type].package
+        try:
+            cause = descriptor.make()
+            mistakes = list(_mistakes(cause, descriptor))
+        except Exception as error:  # noqa: BLE001 - contained: the other causes are tested
+            mistakes = [f"it cannot be made: {_said(error)}"]
+        if mistakes:
+            broken.append((descriptor.type, f"{package} has a mistake: {'; '.join(mistakes)}"))
+        else:
+            causes.append(cause)
+            packages[cause.name] = package
+    return Installed(tuple(causes), tuple(broken), packages)
+
+
+def _mistakes(cause: object, descriptor: CauseDescriptor) -> Iterator[str]:
+    """What keeps a cause of another package from being used."""
+    if not isinstance(cause, Cause):
+        yield f"make returned {cause!r}, which is no Cause"
+        return
+    for name in ("name", "title", "remedy"):
+        if not isinstance(value := getattr(cause, name, None), str):
+            yield f"its {name} is no text: {value!r}"
+    if cause.name != descriptor.type:
+        yield f"its name is {cause.name!r}, and the type of its descriptor {descriptor.type!r}: give both one name"
+    for name in ("needs", "explains"):
+        value = getattr(cause, name)
+        if not isinstance(value, Set) or not all(isinstance(each, str) for each in value):
+            yield f"its {name} are no frozenset of texts: {value!r}"
+        elif name == "needs" and (unknown := sorted(value - STREAMS)):
+            yield f"it needs {', '.join(unknown)}; available: {', '.join(sorted(STREAMS))}"
+
+
+def _said(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}".replace("\n", " ").strip()
+
+
+def _raised(error: Exception, cause: Cause) -> str:
+    """What a test of a cause raised, and the line of its package where that happened."""
+    package = type(cause).__module__.partition(".")[0]
+    frames = [each for each in extract_tb(error.__traceback__) if package in Path(each.filename).parts]
+    place = f" ({'/'.join(Path(frames[-1].filename).parts[-2:])}:{frames[-1].lineno})" if frames else ""
+    return f"{_said(error)}{place}"
 
 
 def diagnose(
@@ -52,19 +102,29 @@ def diagnose(
     Args:
         window: what happened.
         reference: what it is compared with.
-        causes: by default all installed ones.
+        causes: those to test, which raise what they raise; by default all installed ones, whose mistakes are listed.
         tested: called with the name of each cause after its test.
     """
     there = window.streams | reference.streams
     findings: list[Finding] = []
     healthy, untested, measured = [], [], []
-    for cause in installed_causes() if causes is None else causes:
+    installed = installed_causes() if causes is None else None
+    broken = list(installed.broken) if installed is not None else []
+    for cause in causes if installed is None else installed.causes:
         if (cause.needs - there) & {"demonstration", "motion", "rig"}:
             continue  # it is about another kind of window
         if lacking := sorted(cause.needs - there):
             untested.append((cause.name, _LACKS.get(lacking[0], lacking[0])))
             continue
-        evidence = cause.test(window, reference)
+        try:
+            evidence = cause.test(window, reference)
+            if not isinstance(evidence, Evidence | None):
+                raise TypeError(f"test returned {evidence!r}: return an Evidence, or None")
+        except Exception as error:
+            if installed is None:
+                raise
+            broken.append((cause.name, f"{installed.packages[cause.name]} has a mistake: {_raised(error, cause)}"))
+            continue
         if evidence is not None and evidence.likelihood >= ACCUSED:
             findings.append(Finding(cause, evidence))
         else:
@@ -72,7 +132,8 @@ def diagnose(
             if evidence is not None:
                 measured.append(Finding(cause, evidence))
         tested(cause.name)
-    return Diagnosis(ranked(findings), tuple(healthy), tuple(untested), tuple(measured))
+    untested += broken
+    return Diagnosis(ranked(findings), tuple(healthy), tuple(untested), tuple(measured), tuple(broken))
 
 
 def ranked(findings: Sequence[Finding]) -> tuple[Finding, ...]:

@@ -83,6 +83,7 @@ class Preflight:
             if evidence.verdict in ("warn", "fail"):
                 lines.append(f"      What to do: {each.cause.remedy}")
         lines += [f"note  {note}" for note in self.notes]
+        lines += [f"note  {name} was not tested: {why}" for name, why in self.diagnosis.broken]
         lines.append(self.first)
         if self.file is not None:
             lines.append(f"reference -> {self.file}")

@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections import Counter
+from functools import cache
 from typing import Any
 
 import attrs
 import numpy as np
 import pytest
+from ibrobot_diagnose import diagnosis
 from ibrobot_diagnose.card import make_card
-from ibrobot_diagnose.cause import KIND, Cause, CauseDescriptor, Evidence, Reference
+from ibrobot_diagnose.cause import KIND, OWN_NAMES, Cause, CauseDescriptor, Evidence, Reference
+from ibrobot_diagnose.causes import all_causes
 from ibrobot_diagnose.causes.data import UnseenStates
 from ibrobot_diagnose.causes.motion import AnswersTremble
-from ibrobot_diagnose.diagnosis import diagnose, installed_causes
+from ibrobot_diagnose.diagnosis import diagnose
 from ibrobot_diagnose.report import Explanation
 from made_runs import Run, window_of
 from numpy.typing import NDArray
 from planted_faults import JOINTS, PICTURES, TIMES, of_top
 
-from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import Registry
+from ibrobot_core.api import Late, Options, option
+from ibrobot_core.plugins import Entry, Failure, Registry
 
 ONE: dict[str, Any] = {"cameras": ("top",), "camera_hz": 5.0, "seconds": 5}
 BOTH: dict[str, Any] = {"camera_hz": 5.0, "seconds": 5}
@@ -95,10 +99,10 @@ def test_healthy_runs_accuse_nobody_with_the_data(outcome, data):
 
 
 def test_each_cause_says_what_to_do():
-    for cause in installed_causes():
+    for cause in all_causes():
         assert cause.remedy.endswith("."), cause.name
         assert cause.title[0].islower(), cause.name
-        assert cause.explains <= {each.name for each in installed_causes()} | {"camera_ignored"}, cause.name
+        assert cause.explains <= {each.name for each in all_causes()} | {"camera_ignored"}, cause.name
 
 
 def test_gripper_that_holds_something_is_no_fault():
@@ -169,13 +173,136 @@ class Squeaks(Cause):
         return Evidence("A joint squeaks.", 1.0, "joints", 0.5, 0.9)
 
 
+def offered(monkeypatch, *causes, failures=()):
+    """Let `ibrobot-plugin-squeaks` offer causes, and nobody else."""
+    entries = {}
+    for each in causes:
+        descriptor = each if isinstance(each, CauseDescriptor) else CauseDescriptor(each.name, make=each, summary="-")
+        entries[KIND, descriptor.type] = Entry(KIND, descriptor, "squeaks", "ibrobot-plugin-squeaks", "1.0")
+    registry = Registry(entries, [*failures])
+    monkeypatch.setattr(diagnosis, "installed_plugins", lambda: registry)
+
+
+@cache
+def late_run():
+    return window_of(Run(seed=9310, cameras=(), latency_s=2.0, outcome="failure"))
+
+
 def test_other_packages_add_causes(monkeypatch):
-    offered = CauseDescriptor(type="squeaks", make=Squeaks, summary="a joint squeaks")
-    monkeypatch.setattr(Registry, "of_kind", lambda self, kind: [offered] * (kind == KIND))
-    assert diagnose(window_of(Run(cameras=())), Reference()).first == "squeaks"
-    monkeypatch.setattr(Squeaks, "name", "plan_dry")
-    with pytest.raises(IbrobotError, match="there is a cause 'plan_dry' already"):
-        installed_causes()
+    offered(monkeypatch, Squeaks)
+    found = diagnose(window_of(Run(cameras=())), Reference())
+    assert (found.first, found.broken) == ("squeaks", ())
+
+
+class Raises(Squeaks):
+    def test(self, window, reference):
+        raise KeyError("elbow")
+
+
+class ReturnsANumber(Squeaks):
+    def test(self, window, reference):
+        return 0.9
+
+
+class LikelihoodIsText(Squeaks):
+    def test(self, window, reference):
+        return Evidence("A joint squeaks.", 1.0, "joints", 0.5, "high")
+
+
+class NumberIsNone(Squeaks):
+    def test(self, window, reference):
+        return Evidence("A joint squeaks.", None, "joints", 0.5, 0.9)
+
+
+class DetailsAreText(Squeaks):
+    def test(self, window, reference):
+        return Evidence("A joint squeaks.", 1.0, "joints", 0.5, 0.9, details="of the elbow")
+
+
+class Abstract(Cause):
+    name, title, remedy = "squeaks", "no joint squeaks", "Oil it."
+
+
+class TitleIsMissing(Squeaks):
+    title = None
+
+
+class NeedsAreText(Squeaks):
+    needs = "commands"
+
+
+class NeedsSomethingElse(Squeaks):
+    needs = frozenset({"measured"})
+
+
+class ExplainsATuple(Squeaks):
+    explains = ("plan_dry",)
+
+
+def unfinished():
+    raise NotImplementedError
+
+
+MISTAKES = {
+    Raises: r"KeyError: 'elbow' \(tests/test_causes.py:\d+\)",
+    ReturnsANumber: "TypeError: test returned 0.9: return an Evidence, or None",
+    LikelihoodIsText: "TypeError: .*'likelihood' must be",
+    NumberIsNone: "TypeError: .*'number' must be",
+    DetailsAreText: "TypeError: .*'details' must be",
+    Abstract: "it cannot be made: TypeError: Can't instantiate abstract class Abstract",
+    TitleIsMissing: "its title is no text: None",
+    NeedsAreText: "its needs are no frozenset of texts: 'commands'",
+    NeedsSomethingElse: "it needs measured; available: answers, ",
+    ExplainsATuple: r"its explains are no frozenset of texts: \('plan_dry',\)",
+    unfinished: "it cannot be made: NotImplementedError",
+    dict: "make returned {}, which is no Cause",
+    Late("squeaks_nowhere:Squeaks"): "it cannot be made: ModuleNotFoundError: No module named 'squeaks_nowhere'",
+    AnswersTremble: "its name is 'answers_tremble', and the type of its descriptor 'squeaks': give both one name",
+}
+
+
+@pytest.mark.parametrize("make", MISTAKES, ids=str)
+def test_mistake_in_a_cause_names_it_and_its_package_and_keeps_the_others(make, monkeypatch):
+    offered(monkeypatch, CauseDescriptor("squeaks", make=make, summary="-"))
+    found = diagnose(late_run(), Reference())
+    ((name, why),) = found.broken
+    assert (name, found.first) == ("squeaks", "answers_slow")
+    assert re.search(f"^ibrobot-plugin-squeaks has a mistake: {MISTAKES[make]}", why), why
+    text = "\n".join(Explanation.of(late_run(), Reference(), found).lines())
+    assert f"Not tested, since {why}: squeaks." in text
+
+
+def test_mistake_in_a_cause_under_test_is_raised():
+    with pytest.raises(KeyError):
+        diagnose(window_of(Run(cameras=())), Reference(), [Raises()])
+
+
+def test_plugin_that_failed_is_named(monkeypatch):
+    reason = "unknown hook 'ibrobot_cause', did you mean 'ibrobot_causes'?"
+    failure = Failure("squeaks", "ibrobot-plugin-squeaks", "hooks", reason)
+    offered(monkeypatch, failures=[failure])
+    found = diagnose(late_run(), Reference())
+    text = "\n".join(Explanation.of(late_run(), Reference(), found).lines())
+    assert f"Not tested, since plugin 'squeaks' (ibrobot-plugin-squeaks) has a wrong hook: {reason}: squeaks." in text
+
+
+def test_names_are_known_without_the_causes():
+    assert sorted(each.name for each in all_causes()) == sorted(OWN_NAMES)
+
+
+@pytest.mark.parametrize("name", ["plan_dry", "picture_dark"])
+def test_descriptor_of_a_taken_name_is_refused(name):
+    taken = CauseDescriptor(name, make=Squeaks, summary="-")
+    assert list(taken.mistakes()) == ["ibrobot-plugin-diagnose has a cause of this name: give yours another"]
+
+
+def test_options_of_a_cause_are_refused():
+    @attrs.frozen
+    class Loudness(Options):
+        usual: float = option(0.1, help="usual loudness")
+
+    (mistake,) = CauseDescriptor("squeaks", make=Squeaks, summary="-", options=Loudness).mistakes()
+    assert mistake.startswith("options: nothing sets options of a cause")
 
 
 def test_listing_plugins_imports_no_numpy():

@@ -99,10 +99,12 @@ def _checked(
             facts = {"outcome": result.outcome, "seconds": round(result.seconds, 3)}
             listed.append({"episode": str(episode), **facts, "causes": causes})
     listed.sort(key=lambda each: (-each["causes"][0]["likelihood"], -len(each["causes"]), each["episode"]))
+    broken = Counter(each for result in results.values() for each in result.broken)
     counts = Counter(cause["name"] for each in listed for cause in each["causes"])
     checked = {
         "dataset": str(options.dataset), "episodes": len(episodes), "listed": listed,
         "counts": dict(counts.most_common()), "unreadable": unreadable,
+        "untested": [{"name": name, "why": why, "episodes": count} for (name, why), count in broken.items()],
     }  # fmt: skip
     return checked, {each["episode"]: results[Path(each["episode"])].shown for each in listed}
 
@@ -135,6 +137,8 @@ class Checked:
     """The facts of its findings, most probable first."""
     shown: list[Shown]
     """Pictures of the most probable one, or of the episode."""
+    broken: tuple[tuple[str, str], ...]
+    """Names of causes with a mistake, and which."""
 
 
 def check_episode(order: tuple[Path, Card], progress: Callable[[int], None] = lambda more: None) -> Checked:
@@ -145,11 +149,13 @@ def check_episode(order: tuple[Path, Card], progress: Callable[[int], None] = la
     """
     episode, card = order
     window = read_episode(episode)
-    findings = diagnose(window, Reference(card)).findings
+    diagnosis = diagnose(window, Reference(card))
+    findings = diagnosis.findings
     shown = list(findings[0].evidence.pictures) if findings else []
     if findings and not shown:
         shown = list(_seen(window, findings[0].evidence.since_s or 0.0))
-    return Checked(window.outcome, window.seconds, [finding_facts(each) for each in findings], shown[:_MOST])
+    facts = [finding_facts(each) for each in findings]
+    return Checked(window.outcome, window.seconds, facts, shown[:_MOST], diagnosis.broken)
 
 
 def _seen(window: Window, at_s: float) -> Iterator[Shown]:
@@ -161,14 +167,19 @@ def _seen(window: Window, at_s: float) -> Iterator[Shown]:
 
 
 def lines_of(checked: Mapping[str, Any]) -> list[str]:
-    """A line for each listed episode, worst first, and the counts."""
-    listed = checked["listed"]
+    """A line for each listed episode, worst first, and each cause with a mistake; at last the counts."""
+    listed, of = checked["listed"], checked["episodes"]
+    untested = [
+        f"Not tested{'' if each['episodes'] == of else f' in {each["episodes"]} of {of} episodes'}: "
+        f"{each['name']}, since {each['why']}."
+        for each in checked["untested"]
+    ]
     if not listed:
-        return [f"All {checked['episodes']} episodes are like one another: nothing was found."]
+        return [*untested, f"All {of} episodes are like one another: nothing was found."]
     lines = []
     for each in listed:
         first, *others = each["causes"]
         more = f" Also: {', '.join(other['name'] for other in others)}." if others else ""
         lines.append(f"{each['episode']}: {first['text']}{more}")
     names = ", ".join(f"{name} {count}" for name, count in checked["counts"].items())
-    return [*lines, f"{len(listed)} of {checked['episodes']} episodes to look at: {names}"]
+    return [*lines, *untested, f"{len(listed)} of {of} episodes to look at: {names}"]
