@@ -15,8 +15,13 @@ DEBUG = "IBROBOT_DEBUG"
 _NOTED = "its traceback is in "
 
 
-def describe_bug(error: BaseException) -> str:
-    """The error, its place, and the file with its traceback, which is written once per error."""
+def describe_bug(error: BaseException, *, placed: bool = True) -> str:
+    """The error, its place, and the file with its traceback, which is written once per error.
+
+    Args:
+        error: what was raised.
+        placed: whether to name the place; the one that raised it is not always the one to blame.
+    """
     text = printable("".join(traceback.format_exception(error)))
     message = f"{type(error).__name__}: {error}".strip().removesuffix(":").replace("\n", "; ")
     if os.environ.get(DEBUG):
@@ -33,7 +38,7 @@ def describe_bug(error: BaseException) -> str:
             return f"{message} (no file for its traceback: {full.strerror})"
         notes = [f"{_NOTED}{name}"]
         error.add_note(notes[0])
-    return f"{message} ({_place(error)}{notes[0]})"
+    return f"{message} ({_place(error) if placed else ''}{notes[0]})"
 
 
 def _place(error: BaseException) -> str:

@@ -17,8 +17,10 @@ import attrs
 import pluggy
 
 from ibrobot_core import descriptors, hookspecs, plugin_messages
+from ibrobot_core.bug_reports import describe_bug
 from ibrobot_core.errors import (
     ContractError,
+    IbrobotError,
     MissingDependency,
     PluginError,
     PluginNotInstalled,
@@ -150,9 +152,18 @@ class Registry:
         """An object of a type, made of options and context.
 
         Raises:
-            PluginError: as `find`, or if `make` of the descriptor returns something else.
+            PluginError: as `find`, or if `make` of the descriptor returns something else or has a bug: any error but an
+                IbrobotError.
         """
-        made = self.find(kind, type_).make(*arguments)
+        descriptor = self.find(kind, type_)
+        try:
+            made = descriptor.make(*arguments)
+        except IbrobotError:
+            raise
+        except Exception as error:
+            name, plugin = getattr(arguments[-1], "name", kind), self.entries[kind, type_].plugin
+            failed = f"{name}: plugin {plugin!r} failed in make of {plugin_type(kind, type_)}"
+            raise PluginError(f"{failed}: {describe_bug(error, placed=False)}") from error
         wanted = vars(import_module("ibrobot_core.interfaces")).get(kind.capitalize(), object)
         if made is None or not isinstance(made, wanted):
             raise PluginError(f"make of {plugin_type(kind, type_)} returned {made!r}; expected {wanted.__name__}")
@@ -358,8 +369,7 @@ def _offered(manager: pluggy.PluginManager, hook: str, expected: type[Any] | Non
         for field in attrs.fields(type(each)):
             if not isinstance(value := getattr(each, field.name), _CLASSES.get(field.type, object)):
                 raise TypeError(f"{expected.__name__}.{field.alias} must be a {field.type}, not {value!r}")
-        described = isinstance(each, descriptors.Descriptor | descriptors.MessageDescriptor)
-        for mistake in each.mistakes() if described else ():
+        for mistake in getattr(each, "mistakes", tuple)():
             raise TypeError(f"{expected.__name__} {each.type!r}: {mistake}")
     ((plugin, _),) = manager.list_name_plugin()
     return [attrs.evolve(each, **_contained(each, f"plugin {plugin!r} failed in %s of {hook}: %s")) for each in offers]

@@ -32,7 +32,23 @@ def check_key(key: str) -> None:
         raise ValueError(f"{key!r} is not a key: give the character that it types, or a name: {', '.join(KEY_NAMES)}")
 
 
-class RunHooks:
+class Told:
+    """What a part of a run tells the operator; the base class tells nothing."""
+
+    def help(self) -> str:
+        """Instructions for the operator: for a source, in its mode; for hooks, on their keys."""
+        return ""
+
+    def summary_rows(self) -> list[tuple[str, str]]:
+        """Rows for the summary of the run: heading and text."""
+        return []
+
+    def facts(self) -> dict[str, Any]:
+        """Facts for the summary as JSON."""
+        return {}
+
+
+class RunHooks(Told):
     """A command's additions to a run. The base class adds nothing."""
 
     def step(self) -> None:
@@ -49,15 +65,3 @@ class RunHooks:
     def line(self) -> str:
         """Text for a plain status line."""
         return ""
-
-    def help(self) -> str:
-        """Help on the keys, for the panel."""
-        return ""
-
-    def summary_rows(self) -> list[tuple[str, str]]:
-        """Rows for the summary of the run: heading and text."""
-        return []
-
-    def facts(self) -> dict[str, Any]:
-        """Facts for the summary as JSON."""
-        return {}

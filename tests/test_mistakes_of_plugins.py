@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from ibrobot_testing import host_context
 
 from ibrobot_core.config import load_config
-from ibrobot_core.errors import ConfigError, ContractError, PluginError
+from ibrobot_core.errors import ConfigError, ContractError, PluginError, TeleopError
 from ibrobot_core.messages import MESSAGE_TYPES
 from ibrobot_core.plugins import discover
 from ibrobot_core.selection import Selection
@@ -203,6 +204,36 @@ def test_make_of_something_else_is_named(site: Site, tmp_path: Path, made: str, 
     registry = discover(site.entry_points())
     with pytest.raises(PluginError, match=message):
         registry.create("teleop", "wave", None, None)
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        ("Wave(1)", "TypeError: Wave() takes no arguments (its traceback is in "),
+        ("Teleop()", "TypeError: Can't instantiate abstract class Teleop without an implementation for "),
+        (
+            'Late("fake_wave:Wafe")()',
+            "AttributeError: module 'fake_wave' has no attribute 'Wafe' (its traceback is in ",
+        ),
+        ("1 / 0", "ZeroDivisionError: division by zero (its traceback is in "),
+        ("open('/nowhere/else')", "FileNotFoundError: "),
+    ],
+)
+def test_bug_in_make_names_the_component_and_the_plugin(site: Site, tmp_path: Path, made: str, message: str) -> None:
+    head = HEAD.replace("hookimpl,", "Late, hookimpl,")
+    offer(site, tmp_path, head + YIELDS.replace("Wave,", f"lambda options, ctx: {made},"))
+    registry = discover(site.entry_points())
+    with pytest.raises(PluginError) as raised:
+        registry.create("teleop", "wave", None, host_context(name="leader"))
+    assert str(raised.value).startswith(f"leader: plugin 'fake_wave' failed in make of teleop type 'wave': {message}")
+
+
+def test_error_that_make_means_is_not_changed(site: Site, tmp_path: Path) -> None:
+    source = "from ibrobot_core.api import TeleopError\n\n\ndef refuse(options, ctx):\n    raise TeleopError('busy')\n"
+    offer(site, tmp_path, HEAD + source + YIELDS.replace("Wave,", "refuse,"))
+    registry = discover(site.entry_points())
+    with pytest.raises(TeleopError, match=r"^busy$"):
+        registry.create("teleop", "wave", None, host_context())
 
 
 def test_option_that_hides_a_key_of_its_section_is_named(site: Site, tmp_path: Path) -> None:

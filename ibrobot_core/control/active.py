@@ -9,7 +9,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.errors import GoalRejected
+from ibrobot_core.errors import GoalRejected, PluginError
 from ibrobot_core.interfaces import Executor, JointReading, Plan
 from ibrobot_core.interfaces.executor import ExecutorGoal, SlowDown
 from ibrobot_core.interfaces.run_state import PlanRecord
@@ -81,11 +81,18 @@ class ActiveExecutors:
                 self._brake(owned, measured)
 
     def update(self, measured: JointReading) -> list[tuple[NDArray[np.intp], Vector]]:
-        """Return the joint indices of each active executor and its setpoints for them [rad]."""
+        """Return the joint indices of each active executor and its setpoints for them [rad].
+
+        Raises:
+            PluginError: if an executor returns something else.
+        """
         setpoints = []
         self.want_relax = False
         for owned in self._active:
             setpoint = owned.executor.update(owned.reading(measured))
+            if getattr(setpoint, "dtype", None) != np.float64 or setpoint.shape != owned.columns.shape:
+                wanted = f"expected setpoints [rad]: a float64 array of shape ({len(owned.columns)},)"
+                raise PluginError(f"{owned.name}: update of {type(owned.executor)} returned {setpoint!r}; {wanted}")
             if owned.executor.is_stale:
                 setpoint = self._brake(owned, measured)
             setpoints.append((owned.columns, setpoint))

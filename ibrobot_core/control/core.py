@@ -95,7 +95,7 @@ class ControlCore:
             commands.RaiseFault: self._raise_fault,
             commands.ClearFaults: self._reset,
             commands.SendGoal: self._goal,
-            commands.CancelGoals: self._cancel,
+            commands.CancelGoals: lambda executor: self._executors.cancel(self._at_tick, executor),
             commands.GetCounters: self.counters,
             commands.Halt: self._halt,
             commands.BeginStartup: self.begin_startup,
@@ -576,6 +576,3 @@ class ControlCore:
             raise HardwareError(f"goal {goal_id}: refused, a stop, a reset or another mode came after it was requested")
         self._executors.set_goal(executor, goal_id, goal, self._at_tick)
         self._commanded_ns = self._clock.now_ns()
-
-    def _cancel(self, executor: str) -> None:
-        self._executors.cancel(self._at_tick, executor)

@@ -24,10 +24,11 @@ from ibrobot_core.interfaces.hardware import JointReading
 from ibrobot_core.interfaces.teleop import OperatorEvent
 from ibrobot_core.pulses import Pulse
 from ibrobot_core.robot import Vector
+from ibrobot_core.run_hooks import Told
 from ibrobot_core.schema import ControlMode, RobotConfig
 
 
-class CommandSource:
+class CommandSource(Told):
     """Commands the active executors of a mode, from `begin` to `end`. The base class sends nothing.
 
     Attributes:
@@ -56,18 +57,6 @@ class CommandSource:
     def described(self) -> Mapping[str, str] | None:
         """Name and weights of the policy that it runs; None without one."""
         return None
-
-    def help(self) -> str:
-        """Instructions for the operator in this mode."""
-        return ""
-
-    def summary_rows(self) -> list[tuple[str, str]]:
-        """Rows for the summary of the run: heading and text."""
-        return []
-
-    def facts(self) -> dict[str, Any]:
-        """Facts for the summary as JSON."""
-        return {}
 
 
 @attrs.frozen

@@ -85,18 +85,12 @@ def mode_components(session: Session, name: str, link: TransportLink | None) -> 
         policy = PolicySource(session, mode, mode.inference, model, needs)
         if mode.inference.intervene is None:
             return ModeComponents((model,), policy)
-        return ModeComponents((model,), _source("intervene", session, mode, policy), policy)
+        return ModeComponents((model,), session.registry.create("source", "intervene", session, mode, policy), policy)
     if mode.teleop is not None:
         return ModeComponents((), TeleopSource(session, mode))
     if mode.planner is not None:
-        return ModeComponents((), _source("planner", session, mode))
+        return ModeComponents((), session.registry.create("source", "planner", session, mode))
     return ModeComponents((), CommandSource())
-
-
-def _source(type_: str, *arguments: Any) -> SourceWorker:
-    session: Session = arguments[0]
-    source: SourceWorker = session.registry.create("source", type_, *arguments)
-    return source
 
 
 def _sensors(session: Session) -> list[PeripheralConfig]:

@@ -8,7 +8,8 @@ import pytest
 
 from ibrobot_core.control import core
 from ibrobot_core.control.commands import CancelGoals, SendGoal, SwitchMode
-from ibrobot_core.errors import ConfigError, HardwareError, NotSupported
+from ibrobot_core.control.position import PositionExecutor
+from ibrobot_core.errors import ConfigError, HardwareError, NotSupported, PluginError
 from ibrobot_core.interfaces.executor import FollowTrajectory, SlowDown
 from ibrobot_core.interfaces.run_state import PlanRecord
 from ibrobot_core.messages import Header, JointTrajectory, JointTrajectoryPoint
@@ -126,6 +127,28 @@ class TestLateTicks:
 
         punctual, late = commands
         np.testing.assert_array_equal(late, punctual)
+
+
+class TestWrongSetpoints:
+    @pytest.mark.parametrize(
+        "result",
+        [
+            None, 0.1, 1, True, "0.1", [0.1, 0.2, 0.3], (0.1, 0.2, 0.3), {}, np.float64(0.1), np.array(0.1),
+            np.zeros(1), np.zeros(4), np.zeros((1, 3)), np.zeros((3, 1)), np.zeros(3, np.int64), np.array([None] * 3),
+            np.array(["a"] * 3), np.zeros(3, complex),
+        ],
+        ids=repr,
+    )  # fmt: skip
+    def test_end_the_run_with_the_executor_and_its_class(self, make_rig, monkeypatch, result):
+        rig = make_rig({}).start()
+        monkeypatch.setattr(PositionExecutor, "update", lambda self, measured: result)
+        written = len(rig.hardware.written)
+
+        with pytest.raises(
+            PluginError, match=r"\w+: update of <class 'ibrobot_core.control.position.PositionExecutor'> ret"
+        ):
+            rig.tick()
+        assert len(rig.hardware.written) == written
 
 
 class TestGoals:

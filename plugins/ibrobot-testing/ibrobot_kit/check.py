@@ -25,6 +25,8 @@ _CORE = "ibrobot-core"
 _HOOK = re.compile(r"SKIPPED .*: override (\w+) to have")
 """What the suites say of a check that needs a hook."""
 _TESTS_S = 600.0
+_NAMED = 8
+"""How many tests that fail are named."""
 
 
 @attrs.frozen
@@ -65,7 +67,8 @@ def examine(package: str, registry: Registry) -> Iterator[Check]:
     points = [each for each in installed.entry_points if each.group.partition(".")[0] == "ibrobot"]
     if not points:
         raise RequestError(
-            f"{package} {installed.version} has no entry point in the group `ibrobot`, so it is not a plugin"
+            f"{package} {installed.version} has no entry point in the group `ibrobot`, so it is not a plugin: add "
+            f"[project.entry-points.ibrobot] to its pyproject.toml, and install it again by {how_to_install('-e', '.')}"
         )
     failures = [failure for failure in registry.failures if failure.package == installed.name]
     for failure in failures:
@@ -171,7 +174,7 @@ def _tests(package: Distribution) -> Iterator[Check]:
             "tests", False, f"{tests} has no conformance suite", "subclass the suite of its kind, of ibrobot_testing"
         )
         return
-    command = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "tests"]
+    command = [sys.executable, "-m", "pytest", "-q", "-rsfE", "-p", "no:cacheprovider", "tests"]
     try:
         done = subprocess.run(
             command, cwd=folder, capture_output=True, text=True, errors="replace", check=False, timeout=_TESTS_S
@@ -180,7 +183,10 @@ def _tests(package: Distribution) -> Iterator[Check]:
         yield Check("tests", False, f"did not end within {_TESTS_S:g} s", f"cd {folder} && pytest")
         return
     lines = done.stdout.strip().splitlines() or done.stderr.strip().splitlines() or ["no output"]
-    yield Check("tests", done.returncode == 0, lines[-1].strip("= "), f"cd {folder} && pytest")
+    failed = [line for line in lines if line.startswith(("FAILED ", "ERROR "))]
+    more = [f"and {len(failed) - _NAMED} more"] if len(failed) > _NAMED else []
+    found = "; ".join([lines[-1].strip("= "), *failed[:_NAMED], *more])
+    yield Check("tests", done.returncode == 0, found, f"cd {folder} && pytest")
     if hooks := sorted(set(_HOOK.findall(done.stdout))):
         remedy = "how-to/test-a-plugin says what each makes the device do"
         yield Check("not checked", False, f"the suite overrides no {', '.join(hooks)}", remedy, matters=False)

@@ -20,7 +20,7 @@ import attrs
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ibrobot_core import api
-from ibrobot_core.api import Late, how_to_install, option
+from ibrobot_core.api import Descriptor, Late, did_you_mean, how_to_install, option
 from ibrobot_core.app import Registry, RequestError, echo, installed_plugins
 from ibrobot_kit.excerpt import excerpt
 from ibrobot_kit.imports import arranged
@@ -102,9 +102,14 @@ def render(kind: str, name: str, *, outside: bool = True) -> dict[str, str]:
         outside: whether the package has a repository of its own.
 
     Raises:
-        PluginError: if there is no sample of this kind; names the available ones, or the package to install.
+        RequestError: if there is no sample of this kind, with the available ones; or if the name is taken.
+        PluginNotInstalled: if another package has the sample; names it.
     """
     registry = installed_plugins()
+    if (SAMPLE, kind) not in registry.entries:
+        missing = registry.not_found(SAMPLE, kind)
+        unknown = RequestError(f"KIND is {kind!r}{did_you_mean(kind, registry.types(SAMPLE), 'kinds')}")
+        raise missing if hasattr(missing, "package") else unknown
     place = registry.find(SAMPLE, kind).make
     assert isinstance(place, Late)
     source, _, begun = place.place.partition(":")
@@ -137,6 +142,7 @@ def render(kind: str, name: str, *, outside: bool = True) -> dict[str, str]:
     parts = _parts(templates, facts, "interface", "described", "needs", "test_needs")
     interface = parts["interface"] or kind
     facts |= _offered(registry, interface, parts["described"])
+    _check_free(registry, interface, name, facts)
     package = registry.entries[SAMPLE, kind].package
     needed = [package] if package != "ibrobot-testing" else []
     facts["core"] = _compatible("ibrobot-core")
@@ -176,6 +182,22 @@ def render(kind: str, name: str, *, outside: bool = True) -> dict[str, str]:
     facts["outside"] = outside
     made_files = {path: environment.get_template(f"{each}.jinja").render(facts) for each, path in files.items()}
     return {**made_files, f"{own}/py.typed": "", "LICENSE": _license()}
+
+
+def _check_free(registry: Registry, kind: str, name: str, facts: Mapping[str, Any]) -> None:
+    """Check that no other package offers the type.
+
+    Raises:
+        RequestError: if one does; names it.
+    """
+    offered = registry.entries.get((kind, name))
+    package = registry.command_packages.get(name, "") if kind == "command" else offered.package if offered else ""
+    if package:
+        raise RequestError(f"NAME is {name!r}: {package} has a {kind} of this name; choose another, e.g. my_{name}")
+    descriptor = Late(f"{facts['descriptor_module']}:{facts['descriptor']}").load()
+    if issubclass(descriptor, Descriptor):
+        for mistake in descriptor(name, make=Late(facts["place"]), summary=facts["summary"]).mistakes():
+            raise RequestError(f"NAME is {name!r}: {mistake}")
 
 
 def _summary(text: str) -> str:

@@ -150,6 +150,7 @@ def test_tests_of_the_source_are_run(site: Site, tmp_path: Path, monkeypatch: py
     check = checks()["tests"]
     assert not check.ok
     assert "1 failed" in check.found
+    assert "FAILED tests/test_odd_one.py::TestOddOne::test_" in check.found
     assert check.remedy == f"cd {folder} && pytest"
     assert "not checked" not in checks()
     (folder / "tests/test_odd_one.py").write_text("def test_nothing(): pass\n")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import tomllib
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -123,8 +124,32 @@ def test_name_that_the_package_itself_needs_is_an_error(tmp_path: Path, kind: st
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("kind", "name", "package"),
+    [
+        ("executor", "position", "ibrobot-core"),
+        ("hardware", "fake", "ibrobot-testing"),
+        ("command", "launch", "ibrobot-core"),
+        ("transport", "local", "ibrobot-core"),
+    ],
+)
+def test_type_that_another_package_offers_is_an_error(tmp_path: Path, kind: str, name: str, package: str) -> None:
+    with pytest.raises(
+        RequestError, match=f"^NAME is '{name}': {package} has a {kind} of this name; choose another, e.g. my_{name}$"
+    ):
+        NewPlugin(kind, name, tmp_path)()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(find_spec("ibrobot_diagnose") is None, reason="needs ibrobot-plugin-diagnose")
+def test_name_that_the_descriptor_refuses_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match="^NAME is 'plan_dry': ibrobot-plugin-diagnose has a cause of this name"):
+        NewPlugin("cause", "plan_dry", tmp_path)()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_unknown_kind_is_named_and_so_is_a_near_one(tmp_path: Path) -> None:
-    with pytest.raises(IbrobotError, match=r"unknown sample type 'telepo', did you mean 'teleop'"):
+    with pytest.raises(IbrobotError, match=r"^KIND is 'telepo', did you mean 'teleop'\?$"):
         NewPlugin("telepo", "my_stick", tmp_path)()
     assert list(tmp_path.iterdir()) == []
 
