@@ -155,9 +155,8 @@ class Registry:
             PluginError: as `find`, or if `make` of the descriptor returns something else or has a bug: any error but an
                 IbrobotError.
         """
-        descriptor = self.find(kind, type_)
         try:
-            made = descriptor.make(*arguments)
+            made = self.find(kind, type_).make(*arguments)
         except IbrobotError:
             raise
         except Exception as error:

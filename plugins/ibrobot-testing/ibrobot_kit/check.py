@@ -185,8 +185,8 @@ def _tests(package: Distribution) -> Iterator[Check]:
     lines = done.stdout.strip().splitlines() or done.stderr.strip().splitlines() or ["no output"]
     failed = [line for line in lines if line.startswith(("FAILED ", "ERROR "))]
     more = [f"and {len(failed) - _NAMED} more"] if len(failed) > _NAMED else []
-    found = "; ".join([lines[-1].strip("= "), *failed[:_NAMED], *more])
-    yield Check("tests", done.returncode == 0, found, f"cd {folder} && pytest")
+    told = "; ".join([lines[-1].strip("= "), *failed[:_NAMED], *more])
+    yield Check("tests", done.returncode == 0, told, f"cd {folder} && pytest")
     if hooks := sorted(set(_HOOK.findall(done.stdout))):
         remedy = "how-to/test-a-plugin says what each makes the device do"
         yield Check("not checked", False, f"the suite overrides no {', '.join(hooks)}", remedy, matters=False)

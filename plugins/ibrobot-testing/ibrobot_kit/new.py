@@ -106,12 +106,7 @@ def render(kind: str, name: str, *, outside: bool = True) -> dict[str, str]:
         PluginNotInstalled: if another package has the sample; names it.
     """
     registry = installed_plugins()
-    if (SAMPLE, kind) not in registry.entries:
-        missing = registry.not_found(SAMPLE, kind)
-        unknown = RequestError(f"KIND is {kind!r}{did_you_mean(kind, registry.types(SAMPLE), 'kinds')}")
-        raise missing if hasattr(missing, "package") else unknown
-    place = registry.find(SAMPLE, kind).make
-    assert isinstance(place, Late)
+    place = _begun(registry, kind)
     source, _, begun = place.place.partition(":")
     module = import_module(source)
     title = "".join(word.capitalize() for word in name.split("_"))
@@ -182,6 +177,17 @@ def render(kind: str, name: str, *, outside: bool = True) -> dict[str, str]:
     facts["outside"] = outside
     made_files = {path: environment.get_template(f"{each}.jinja").render(facts) for each, path in files.items()}
     return {**made_files, f"{own}/py.typed": "", "LICENSE": _license()}
+
+
+def _begun(registry: Registry, kind: str) -> Late:
+    """The place of what a package of a kind begins with."""
+    if (SAMPLE, kind) not in registry.entries:
+        missing = registry.not_found(SAMPLE, kind)
+        unknown = RequestError(f"KIND is {kind!r}{did_you_mean(kind, registry.types(SAMPLE), 'kinds')}")
+        raise missing if hasattr(missing, "package") else unknown
+    place = registry.find(SAMPLE, kind).make
+    assert isinstance(place, Late)
+    return place
 
 
 def _check_free(registry: Registry, kind: str, name: str, facts: Mapping[str, Any]) -> None:

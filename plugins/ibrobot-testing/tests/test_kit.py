@@ -143,7 +143,7 @@ def test_type_that_another_package_offers_is_an_error(tmp_path: Path, kind: str,
 
 @pytest.mark.skipif(find_spec("ibrobot_diagnose") is None, reason="needs ibrobot-plugin-diagnose")
 def test_name_that_the_descriptor_refuses_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(RequestError, match="^NAME is 'plan_dry': ibrobot-plugin-diagnose has a cause of this name"):
+    with pytest.raises(RequestError, match=r"^NAME is 'plan_dry': ibrobot-plugin-diagnose has a cause of this name"):
         NewPlugin("cause", "plan_dry", tmp_path)()
     assert list(tmp_path.iterdir()) == []
 
