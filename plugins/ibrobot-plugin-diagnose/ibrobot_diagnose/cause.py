@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from numbers import Real
-from typing import TYPE_CHECKING, ClassVar, Literal, override
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast, override
 
 import attrs
 
@@ -64,8 +64,8 @@ class Shown:
     """Shape (H, W, 3)."""
 
 
-_text = attrs.validators.instance_of(str)
-_number = attrs.validators.instance_of(Real)
+_text: Any = attrs.validators.instance_of(str)
+_number: Any = attrs.validators.instance_of(cast(Any, Real))
 
 
 @attrs.frozen(eq=False)

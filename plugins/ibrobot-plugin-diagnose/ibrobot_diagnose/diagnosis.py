@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from traceback import extract_tb
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import attrs
 
@@ -108,20 +108,20 @@ def diagnose(
     there = window.streams | reference.streams
     findings: list[Finding] = []
     healthy, untested, measured = [], [], []
-    installed = installed_causes() if causes is None else None
-    broken = list(installed.broken) if installed is not None else []
-    for cause in causes if installed is None else installed.causes:
+    installed = installed_causes() if causes is None else Installed(tuple(causes), (), {})
+    broken = list(installed.broken)
+    for cause in installed.causes:
         if (cause.needs - there) & {"demonstration", "motion", "rig"}:
             continue  # it is about another kind of window
         if lacking := sorted(cause.needs - there):
             untested.append((cause.name, _LACKS.get(lacking[0], lacking[0])))
             continue
         try:
-            evidence = cause.test(window, reference)
+            evidence: Any = cause.test(window, reference)
             if not isinstance(evidence, Evidence | None):
                 raise TypeError(f"test returned {evidence!r}: return an Evidence, or None")
         except Exception as error:
-            if installed is None:
+            if causes is not None:
                 raise
             broken.append((cause.name, f"{installed.packages[cause.name]} has a mistake: {_raised(error, cause)}"))
             continue
