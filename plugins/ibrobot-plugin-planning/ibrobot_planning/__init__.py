@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ibrobot_core.api import Descriptor, ExecutorDescriptor, Late, hookimpl
+from ibrobot_core.api import Context, Descriptor, ExecutorDescriptor, Late, hookimpl
 from ibrobot_core.app import Command, Kind, SectionDescriptor, SourceDescriptor
 from ibrobot_planning.executors.options import GripperOptions, TrajectoryOptions
 from ibrobot_planning.guard.descriptor import GuardDescriptor
 from ibrobot_planning.guard.options import ClearanceGuardOptions
 from ibrobot_planning.guard.unsaid import unsaid
-from ibrobot_planning.planner import PlannerDescriptor
+from ibrobot_planning.planner import Planner, PlannerDescriptor
 from ibrobot_planning.planners.options import GoalCheckOptions, JointPlannerOptions, RrtConnectOptions
 from ibrobot_planning.world.engines import find_engines
 from ibrobot_planning.world.options import WorldOptions
@@ -47,10 +47,16 @@ def ibrobot_planners() -> Iterable[PlannerDescriptor]:
     yield PlannerDescriptor(
         type="rrt_connect",
         options=RrtConnectOptions,
-        make=Late("ibrobot_planning.planners.rrt:RrtConnectPlanner"),
+        make=_rrt_connect,
         check=find_engines,
         summary="around obstacles, to joint positions or poses of the tool, checked against padding after timing",
     )
+
+
+def _rrt_connect(options: RrtConnectOptions, ctx: Context) -> Planner:
+    find_engines()  # with the remedy, before they are imported
+    planner: Planner = Late("ibrobot_planning.planners.rrt:RrtConnectPlanner")(options, ctx)
+    return planner
 
 
 @hookimpl

@@ -16,8 +16,10 @@ from ibrobot_planning.world.arm import robot_arm
 from ibrobot_planning.world.collision import Collisions, unchecked_pairs
 from ibrobot_planning.world.engines import find_engines
 from ibrobot_planning.world.objects import World
+from ibrobot_testing.contexts import host_context
 
 from ibrobot_core.api import Context, MissingDependency
+from ibrobot_core.app import installed_plugins
 
 from .table_arm import make_robot
 
@@ -68,3 +70,5 @@ def test_missing_system_library_is_named_with_its_package(monkeypatch: pytest.Mo
     monkeypatch.setattr("ctypes.CDLL", load)
     with pytest.raises(MissingDependency, match="sudo apt-get install libgomp1"):
         find_engines()
+    with pytest.raises(MissingDependency, match="sudo apt-get install libgomp1"):
+        installed_plugins().create("planner", "rrt_connect", RrtConnectOptions(), host_context())
