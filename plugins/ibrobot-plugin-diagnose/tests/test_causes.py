@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections import Counter
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import attrs
@@ -19,6 +20,7 @@ from ibrobot_diagnose.cause import KIND, OWN_NAMES, Cause, CauseDescriptor, Evid
 from ibrobot_diagnose.causes import all_causes
 from ibrobot_diagnose.causes.data import UnseenStates
 from ibrobot_diagnose.causes.motion import AnswersTremble
+from ibrobot_diagnose.commands import check
 from ibrobot_diagnose.diagnosis import diagnose
 from ibrobot_diagnose.report import Explanation
 from made_runs import Run, window_of
@@ -472,3 +474,13 @@ def test_gripper_that_begins_at_its_other_end_is_reversed(data):
     )
     first, *_ = diagnose(window, data).findings
     assert first.name == "gripper_reversed"
+
+
+def test_check_of_a_dataset_names_a_cause_with_a_mistake(monkeypatch, data):
+    offered(monkeypatch, Raises)
+    monkeypatch.setattr(check, "read_episode", lambda path: window_of(Run(seed=3, acts=False, seconds=7, cameras=())))
+    ((name, why),) = check.check_episode((Path("one"), data.card)).broken
+    untested = [{"name": name, "why": why, "episodes": 1}]
+    lines = check.lines_of({"episodes": 2, "listed": [], "counts": {}, "untested": untested})
+    assert lines[0].startswith("Not tested in 1 of 2 episodes: squeaks, since ibrobot-plugin-squeaks has a mistake: ")
+    assert lines[-1] == "All 2 episodes are like one another: nothing was found."
