@@ -58,7 +58,7 @@ class Context:
     model: ModelContext | None = None
     """For engines: the model, whose name is that of the context."""
     session: RunView | None = None
-    """For viewers: the run that they show."""
+    """The run, for what is made in its process; None elsewhere."""
 
     @classmethod
     def of(cls, config: RobotConfig, name: str, clock: Clock, seed: int = 0, **more: Any) -> Self:

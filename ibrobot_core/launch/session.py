@@ -175,7 +175,7 @@ class Session:
 
     def make(self, kind: str, component: ComponentConfig, name: str, **more: Any) -> Any:
         """Make a component of the YAML by its plugin; `name` and `more` go into the context."""
-        given = {"bus": self.bus, "keys": self.request.keys, **more}
+        given = {"bus": self.bus, "keys": self.request.keys, "session": self, **more}
         context = Context.of(self.config, name, self.clock, self.request.seed, **given)
         return self.registry.create(kind, component.type, component.options, context)
 

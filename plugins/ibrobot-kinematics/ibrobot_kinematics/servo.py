@@ -38,7 +38,7 @@ _APPROACH_S = 0.15
 """Least time constant with which the tool approaches the bound of a path constraint [s]."""
 _BRAKING = 1.5
 """The same, as a multiple of the time in which the joints stop."""
-_STOPPING = np.array([0.33, 0.67, 1.0])
+_STOPPING = np.linspace(0.1, 1.0, 10)
 """Parts of the way to a stop at which constraints are checked."""
 _RESERVE = 0.25
 """Share of a constraint's `insides` that stays free at a stop, for the jitter of the steps."""
@@ -119,17 +119,19 @@ class Servo:
         self._braking = np.minimum(braking, self._max_acceleration)
         stopping = float((self._max_velocity / self._max_acceleration).max())
         self._approach_s = max(_APPROACH_S, _BRAKING * stopping)
-        self._constraints: ToolConstraints | None = None
+        given, middle = options.path_constraints, (model.lower + model.upper) / 2
+        self._constraints = None if given is None else ToolConstraints(given, model, middle)
+        self._overruled: Vector | None = None
+        """The twist, weighted, along which not all joints could go as asked; None if they could."""
         self._weights = np.concatenate([np.ones(3), _LEVER_M * np.asarray(turn_weights, dtype=float)])
         self.refused: Counter[str] = Counter()
-        self.reset((model.lower + model.upper) / 2)
+        self.reset(middle)
 
     def reset(self, position: Vector) -> None:
         """Rest at a position, and drop the twist.
 
         Args:
-            position: joint positions [rad or m], shape (J,); they decide the `upright_axis` of path constraints that
-                do not give it.
+            position: joint positions [rad or m], shape (J,).
 
         Raises:
             ValueError: if it is not finite or has another shape.
@@ -140,8 +142,7 @@ class Servo:
             )
         self.position = np.array(position, dtype=float)
         self.velocity = np.zeros_like(self.position)
-        if self._options.path_constraints is not None:
-            self._constraints = ToolConstraints(self._options.path_constraints, self._model, self.position)
+        self._overruled = None
         self._state = ServoStatus.NO_WARNING
         self._is_invalid = False
         self._twist: _Twist | None = None
@@ -192,15 +193,33 @@ class Servo:
         self.position = np.array(position, dtype=float)
         self.velocity = np.zeros_like(self.position)
 
+    def overruled(self, position: Vector) -> None:
+        """Rest at the commanded position [rad or m], shape (J,), which is not what was asked for.
+
+        What keeps a robot from collisions may let some joints go on, and others not. Along such a twist, the arm then
+        moves only so that any part of its joints keeps the path constraints.
+        """
+        self.hold_at(position)
+        if self._twist is not None:
+            self._overruled = self._requested(self._twist, self._model.forward(position))
+
+    def stop_position(self) -> Vector:
+        """Where the arm stops if it brakes from now on [rad or m], shape (J,)."""
+        moving = self._model.moving
+        velocity, stop = self.velocity[moving], self.position.copy()
+        stop[moving] += velocity * float(np.max(np.abs(velocity) / self._max_acceleration)) / 2
+        return stop
+
     def halt(self) -> None:
         """Drop the twist: the arm slows down to a stop."""
         self._twist = None
 
-    def step(self, now_ns: int) -> Vector:
+    def step(self, now_ns: int, *, waits: bool = False) -> Vector:
         """Joint positions at a time, shape (J,).
 
         Args:
             now_ns: the time [ns]; if it has not advanced, nothing moves.
+            waits: whether the arm brakes on its way, although there is a twist.
         """
         last, self._last_ns = self._last_ns, now_ns
         if self._twist is not None and now_ns >= self._twist.until_ns:
@@ -214,7 +233,7 @@ class Servo:
         moving = self._model.moving
         lowest, highest = self._bounds(dt)
         wanted = np.zeros(len(moving))
-        if self._twist is not None:
+        if self._twist is not None and not waits:
             wanted = self._joint_speeds(self._twist, np.minimum(lowest, 0), np.maximum(highest, 0))
         else:
             self._state = ServoStatus.NO_WARNING
@@ -224,7 +243,7 @@ class Servo:
         share = min(1.0, float(np.min(most / np.maximum(np.abs(change), 1e-12))))
         after = np.clip(before + share * change, lowest, highest)
         after = np.clip(after, before - most, before + most)
-        if self._constraints is not None and not self._stops_within(self._constraints, after, dt):
+        if waits or (self._constraints is not None and not self._stops_within(self._constraints, after, dt)):
             after = before - before * min(1.0, float(np.min(most / np.maximum(np.abs(before), 1e-12))))
             self._state = ServoStatus.JOINT_BOUND
         self.velocity[moving] = after
@@ -261,12 +280,12 @@ class Servo:
         moving = model.moving
         tip, jacobian = model.forward_and_jacobian(self.position)
         to_tip = tip.rotation.T
-        linear, angular = twist.linear, twist.angular
-        linear, angular = (tip.rotation @ linear, angular) if twist.in_tool else (linear, to_tip @ angular)
         # Turns are in the frame of the tip, where their weights are.
         rates = self._weights[:, None] * np.vstack([jacobian[:3, moving], to_tip @ jacobian[3:, moving]])
-        requested = self._weights * np.concatenate([linear, angular])
+        requested = self._requested(twist, tip)
         self._state = ServoStatus.NO_WARNING
+        if self._overruled is not None and requested @ self._overruled <= 0:
+            self._overruled = None  # away from what held it back
         size = float(np.linalg.norm(requested))
         if size == 0:
             return np.zeros(len(moving))
@@ -310,7 +329,18 @@ class Servo:
             )
         # What remains for a bound is little, and scaling all speeds alike keeps all other bounds.
         towards = rates @ wanted
+        if self._overruled is not None:
+            # Of the joints, any part may stand still.
+            towards = np.maximum(rates * wanted, 0.0).sum(axis=1)
+            if (towards > most).any():
+                self._state = ServoStatus.JOINT_BOUND
         return wanted * float(np.min(np.where(towards > most, most / np.maximum(towards, 1e-12), 1.0)))
+
+    def _requested(self, twist: _Twist, tip: TipPose) -> Vector:
+        """The twist, linear in the base frame and angular in that of the tip, weighted, shape (6,)."""
+        if twist.in_tool:
+            return np.asarray(self._weights * np.concatenate([tip.rotation @ twist.linear, twist.angular]))
+        return np.asarray(self._weights * np.concatenate([twist.linear, tip.rotation.T @ twist.angular]))
 
     def _stops_within(self, constraints: ToolConstraints, velocity: Vector, dt: float) -> bool:
         """Whether the arm, if it brakes after a tick at a velocity [rad/s], shape (n,), stops within all bounds.
@@ -319,8 +349,9 @@ class Servo:
         this check accepted a tick before.
         """
         stopping = dt + float(np.max(np.abs(velocity) / self._max_acceleration)) / 2
-        way = np.repeat(self.position[None], len(_STOPPING) + 1, axis=0)
-        way[1:, self._model.moving] += np.multiply.outer(_STOPPING * (dt + stopping), velocity)
+        times = np.concatenate([[dt], _STOPPING * (dt + stopping)])
+        way = np.repeat(self.position[None], len(times) + 1, axis=0)
+        way[1:, self._model.moving] += np.multiply.outer(times, velocity)
         here, *ahead = constraints.excess(way)
         return bool((ahead <= np.maximum(here, -_RESERVE * constraints.insides)).all())
 

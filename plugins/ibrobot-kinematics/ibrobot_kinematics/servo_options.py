@@ -26,10 +26,17 @@ class ServoOptions(Options):
     slow_distance: float = option(0.05, unit="m", gt=0, help="distance from an obstacle from which the tool slows down")
     stop_distance: float = option(0.01, unit="m", ge=0, help="distance from an obstacle at which it stops")
     path_constraints: PathConstraints | None = option(
-        None, help="what holds while the tool moves, e.g. {upright: 0.17}: near a bound it slows down, and slides along"
+        None, help="what holds while the tool moves, e.g. {upright: 0.17, upright_axis: -z}: near a bound it slows down"
     )
 
     def __attrs_post_init__(self) -> None:
+        kept = self.path_constraints
+        if kept is not None and kept.upright is not None and kept.upright_axis is None:
+            # The axis nearest to the vertical would change with each start, e.g. after a person has tilted the tool.
+            raise ValueError(
+                "path_constraints: a device's upright needs upright_axis, the axis of the tool that points up: x, y, z,"
+                " -x, -y, -z, or three numbers; -z for a tool that points down"
+            )
         for low, high in (
             ("lower_singularity_threshold", "hard_stop_singularity_threshold"),
             ("stop_distance", "slow_distance"),

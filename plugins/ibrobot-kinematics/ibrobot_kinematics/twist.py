@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+from itertools import pairwise
 from typing import override
 
 import numpy as np
@@ -31,6 +33,14 @@ _STATUS_S = 0.1
 """The status is published when it changes, and at least that often [s]."""
 _FOLLOW_RAD = 0.1
 """An arm at rest that is further from its setpoint was moved otherwise, so it starts from its measured position."""
+_ASKED = 50
+"""Number of ticks whose positions are remembered."""
+_LATE = 10
+"""A command follows at most so many ticks after its request."""
+_OVERRULED_RAD = 1e-3
+"""A command that is further from all requests is another's [rad]."""
+_USED_LEAD = 0.7
+"""Share of `max_lead` at which the tool begins to wait. Beyond it, control would hold back one joint, not all."""
 _DIAGNOSTICS = "/diagnostics"
 _PAUSE_NS = ns(0.5)
 """A stream of twists that was silent for so long counts as released [ns]."""
@@ -63,6 +73,8 @@ class TwistTeleop(Teleop):
         """When the last twist was read [ns]."""
         self._fresh = True
         """Whether the next twist starts from the measured position."""
+        self._asked_for: deque[Vector] = deque(maxlen=_ASKED)
+        """The arm's positions that were asked for last [rad], each of shape (N,)."""
         self._published: tuple[ServoStatus, int] | None = None
         """The last published status, and its time [ns]."""
 
@@ -108,13 +120,18 @@ class TwistTeleop(Teleop):
             self._take(servo, received, measured.stamp_ns, here)
         if not self.deadman.allows(measured.stamp_ns):
             servo.halt()
-        position = servo.step(measured.stamp_ns)
+        self._heed_command(servo)
+        waits = not self._follows(servo.stop_position(), here, _USED_LEAD)
+        position = servo.step(measured.stamp_ns, waits=waits)
         moves = not servo.at_rest
-        lead = self._ctx.robot.max_lead[self._indices]
-        if moves and (np.abs(position - here) > lead).any():
-            # A joint does not follow: the tool waits for it.
-            position = np.clip(position, here - lead, here + lead)
+        if not moves:
+            self._asked_for.clear()
+        elif not self._follows(position, here):
+            # A joint is far behind: the tool waits for it, on the way that it came.
+            position = self._back(position, here)
             servo.hold_at(position)
+        if moves:
+            self._asked_for.append(position)
         self._publish_status(servo, measured.stamp_ns)
         if not moves:
             return TeleopCommand(None)
@@ -134,6 +151,43 @@ class TwistTeleop(Teleop):
         frames = f"{options.frame} or {self._ctx.robot.description.tip}"
         return f"publish geometry_msgs/msg/TwistStamped on {options.topic}, its frame_id {frames}"
 
+    def _commanded(self) -> Vector | None:
+        """The arm's positions that control commands [rad], shape (N,); None without a run."""
+        session = self._ctx.session
+        if session is None or session.state is None:
+            return None
+        return np.asarray(session.state.command[session.config.robot.indices(self._arm)])
+
+    def _heed_command(self, servo: Servo) -> None:
+        """Go on from the command where it is not what was asked for, e.g. since the guard holds some joints back.
+
+        Without path constraints, each joint may go on alone.
+        """
+        command = None if self._options.path_constraints is None else self._commanded()
+        if command is None or not self._asked_for:
+            return
+        asked = list(self._asked_for)[-_LATE:]
+        for before, after in pairwise([asked[0], *asked]):
+            low, high = np.minimum(before, after) - _OVERRULED_RAD, np.maximum(before, after) + _OVERRULED_RAD
+            if ((command >= low) & (command <= high)).all():
+                return
+        servo.overruled(command)
+        self._asked_for.clear()
+        self._asked_for.append(command)
+
+    def _follows(self, position: Vector, here: Vector, share: float = 1.0) -> bool:
+        """Whether no joint of the arm, at `here`, is further behind than a share of its `max_lead`."""
+        return bool((np.abs(position - here) <= share * self._ctx.robot.max_lead[self._indices]).all())
+
+    def _back(self, position: Vector, here: Vector) -> Vector:
+        """The last position on the way to `position` that the arm, at `here`, can follow [rad], shape (N,)."""
+        for asked in reversed(self._asked_for):
+            if self._follows(asked, here):
+                return asked.copy()
+        # The arm was moved: nearer to it, all joints alike.
+        lead = self._ctx.robot.max_lead[self._indices]
+        return np.asarray(here + (position - here) * np.min(lead / np.maximum(np.abs(position - here), lead)))
+
     def _asked(self, request: TwistStamped) -> int:
         """Publish the twist of a service call; answers with the newest status."""
         assert self._ctx.bus is not None
@@ -148,7 +202,10 @@ class TwistTeleop(Teleop):
         if fault is None:
             assert isinstance(message, TwistStamped)
             if servo.at_rest and (self._fresh or np.abs(servo.position - here).max() > _FOLLOW_RAD):
-                servo.reset(here)
+                command = None if self._options.path_constraints is None else self._commanded()
+                servo.reset(here if command is None else command)
+                self._asked_for.clear()
+                self._asked_for.append(servo.position.copy())
             twist, in_tool = message.twist, message.header.frame_id == self._ctx.robot.description.tip
             fault = servo.command(_array(twist.linear), _array(twist.angular), now_ns, in_tool=in_tool)
             self._fresh &= fault is not None

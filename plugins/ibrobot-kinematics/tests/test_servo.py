@@ -332,7 +332,7 @@ def level(model: KinematicModel) -> Vector:
 
 
 def constrained(model: KinematicModel, **values: Any) -> tuple[Rig, ToolConstraints]:
-    given_ = PathConstraints(**values)
+    given_ = PathConstraints(**({"upright_axis": "-x"} if "upright" in values else {}) | values)
     start = level(model)
     return Rig(model, ServoOptions(path_constraints=given_), start=start), ToolConstraints(given_, model, start)
 

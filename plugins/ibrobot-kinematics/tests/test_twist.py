@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar, override
+from types import SimpleNamespace
+from typing import Any, ClassVar, override
 
 import attrs
 import numpy as np
 import pytest
-from ibrobot_kinematics import KinematicModel, ServoStatus, robot_model
+from ibrobot_kinematics import KinematicModel, PathConstraints, ServoStatus, ToolConstraints, robot_model
 from ibrobot_kinematics.clearance import CLEARANCE, Configuration
 from ibrobot_kinematics.options import ToolPoseOptions, TwistOptions
 from ibrobot_kinematics.twist import TwistTeleop
@@ -345,6 +347,7 @@ def test_twists_that_waited_longer_than_the_timeout_are_refused(model):
         ({"topic": "twists"}, "'twists' is not a topic: a topic begins with /, e.g. /servo_node/delta_twist_cmds"),
         ({"topic": "/a b"}, "'/a b' is not a topic"),
         ({"status_topic": "/status/"}, "'/status/' is not a topic"),
+        ({"path_constraints": PathConstraints(upright=0.1)}, "path_constraints: a device's upright needs upright_axis"),
         ({"timeout": 5.0}, "5.0 is too large, must be at most 1 s"),
         ({"hard_stop_singularity_threshold": 10.0}, "lower_singularity_threshold is 30, must be below hard_stop"),
     ],
@@ -398,3 +401,69 @@ def test_tool_slows_down_and_stands_before_obstacles(model: Path):
     assert 0.02 < up[2] <= 0.04 - TwistOptions().stop_distance + 1e-4
     assert rig.status.drain()[-1].message == Int8(ServoStatus.DECELERATE_FOR_COLLISION)
     assert rig.follow(twist((0.0, 0.0, -0.1)), seconds=0.3)[2] < -0.02, "it may leave"
+
+
+LEVEL = np.array([0.3, -0.6, 1.1, -0.5, 0.0, 0.4])
+UPRIGHT = PathConstraints(upright=0.1, upright_axis="-x")
+WAYS: list[tuple[Sequence[float], Sequence[float]]] = [
+    ((0.0, 0.0, -0.2), (0.0, 0.0, 0.0)),
+    ((-0.15, 0.0, -0.15), (0.0, 0.0, 0.0)),
+    ((0.0, 0.15, -0.15), (0.0, 0.0, 0.0)),
+    ((0.0, 0.0, 0.2), (0.0, 0.5, 0.0)),
+]
+
+
+class Arm:
+    """A robot of which some joints stand still, in a run whose guard may hold some back."""
+
+    def __init__(self, model: Path, *, held_back: str = "", stuck: str = "") -> None:
+        self.robot = robot_of(model)
+        self.held_back, self.stuck = held_back, stuck
+        self.command, self.measured = LEVEL.copy(), LEVEL.copy()
+        state = SimpleNamespace(command=self.command)
+        session: Any = SimpleNamespace(state=state, config=SimpleNamespace(robot=self.robot))
+        self.ctx = attrs.evolve(host_context("twist", robot=self.robot, clock=SetClock(START_NS)), session=session)
+        self.teleop = TwistTeleop(TwistOptions(path_constraints=UPRIGHT), self.ctx)
+        self.teleop.connect()
+        begin_operation(self.teleop, self.reading())
+        kinematics = robot_model(self.robot)
+        self.constraints = ToolConstraints(UPRIGHT, kinematics, LEVEL)
+        self.excess = [-0.1]
+        """Of each command [rad]."""
+        for _ in range(60):
+            self.tick()
+
+    def reading(self) -> JointReading:
+        return JointReading(self.ctx.clock.now_ns(), self.measured.copy(), np.zeros(6), np.zeros(6))
+
+    def tick(self, *messages: Message) -> None:
+        self.ctx.clock.sleep_until(self.ctx.clock.now_ns() + ns(DT))
+        assert self.ctx.bus is not None
+        for message in messages:
+            self.ctx.bus.publish(TOPIC, message)
+        for name, position in (operate(self.teleop, self.reading()).positions or {}).items():
+            index = self.robot.joint_names.index(name)
+            if name != self.held_back:
+                self.command[index] = position
+            if name != self.stuck:
+                self.measured[index] = self.command[index]
+        self.excess.append(float(self.constraints.excess(self.command)[0]))
+
+
+@pytest.mark.parametrize(("linear", "angular"), WAYS)
+@pytest.mark.parametrize("joint", ["shoulder_lift", "elbow_flex", "wrist_flex"])
+def test_constraint_holds_while_a_guard_holds_a_joint_back(model: Path, joint: str, linear, angular):
+    arm = Arm(model, held_back=joint)
+    for _ in range(300):
+        arm.tick(twist(linear, angular))
+    assert max(arm.excess) <= 0.0
+
+
+@pytest.mark.parametrize(("linear", "angular"), WAYS)
+@pytest.mark.parametrize("joint", ["shoulder_lift", "elbow_flex", "wrist_flex"])
+def test_constraint_holds_for_the_commands_while_a_joint_is_stuck(model: Path, joint: str, linear, angular):
+    arm = Arm(model, stuck=joint)
+    for _ in range(300):
+        arm.tick(twist(linear, angular))
+    assert max(arm.excess) <= 0.0
+    assert np.abs(arm.command - arm.measured).max() <= arm.robot.max_lead[0] + 1e-9
