@@ -12,7 +12,8 @@ from ibrobot_core.app import installed_plugins
 
 pytestmark = pytest.mark.integration
 
-KINDS = sample_kinds(without=("ibrobot-testing",))
+KINDS = [*sample_kinds(without=("ibrobot-testing",)), "message"]
+"""`message` is core's, and its tests need another package of this repository."""
 
 
 @pytest.fixture(scope="module")

@@ -201,7 +201,9 @@ def _check_free(registry: Registry, kind: str, name: str, facts: Mapping[str, An
     if package:
         raise RequestError(f"NAME is {name!r}: {package} has a {kind} of this name; choose another, e.g. my_{name}")
     descriptor = Late(f"{facts['descriptor_module']}:{facts['descriptor']}").load()
-    if issubclass(descriptor, Descriptor):
+    if not issubclass(descriptor, Descriptor):
+        return
+    if {each.name for each in attrs.fields(descriptor) if each.default is attrs.NOTHING} <= {"type", "make", "summary"}:
         for mistake in descriptor(name, make=Late(facts["place"]), summary=facts["summary"]).mistakes():
             raise RequestError(f"NAME is {name!r}: {mistake}")
 
