@@ -529,3 +529,28 @@ def test_goals_of_services_have_the_keys_of_task_files(start, tmp_path):
     assert (answer.code, answer.message) == (PlanCode.INVALID_OBJECT_NAME, "no object 'mug'; the objects are: cup")
     with pytest.raises(RequestError, match=r"goals\.0\.quat: unknown key; known keys: .*, quaternion, "):
         bus.call(PLAN, {"goals": [{"xyz": [0.2, 0.0, 0.1], "quat": [0, 0, 0, 1]}]})
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "joint"),
+    [("jaw=0.1 upright=0.5", "upright", "jaw"), ("jaw=0.1 region=5,5,5,6,6,6", "region", "jaw")],
+)
+def test_constraints_are_refused_where_nothing_is_planned(run, text: str, key: str, joint: str):
+    runtime = run()
+    before = command(runtime)
+    message = f"{key} holds on a planned way, but {joint} goes to its position without a plan: leave {key} out"
+    with pytest.raises(PlanningError, match=message) as refused:
+        runtime.session.bus.call(GO_TO, text)
+    assert refused.value.code is PlanCode.INVALID_GOAL_CONSTRAINTS
+    np.testing.assert_array_equal(command(runtime), before)
+
+
+def test_constraints_are_refused_where_a_joint_of_the_tool_goes_alone(start: Make, tmp_path: Path):
+    text = robot_yaml(tmp_path).replace("flex, roll], gripper: [jaw]", "flex], wrist: [roll], gripper: [jaw]")
+    text = text.replace("executors:\n", "executors:\n  wrist: {type: gripper, group: wrist}\n")
+    runtime = start(text=text.replace("[arm, gripper]", "[arm, wrist, gripper]"))
+    for goal in ("roll=-1.5 upright=0.05", "pan=0.1,roll=0.5 upright=0.5", "left upright=0.5"):
+        with pytest.raises(
+            PlanningError, match="upright holds on a planned way, but roll goes to its position without"
+        ):
+            runtime.session.bus.call(GO_TO, goal)

@@ -32,7 +32,7 @@ from ibrobot_planning.planner import (
 )
 from ibrobot_planning.planners.rrt import RrtConnectPlanner
 from ibrobot_planning.planners.timing import Motion, motion_of, timed
-from ibrobot_planning.world.objects import World
+from ibrobot_planning.world.objects import Sphere, World, WorldObject
 
 from ibrobot_core.api import PlanningError, Pose, Robot, Vector, Vector3
 from ibrobot_core.app import PlanCode
@@ -326,7 +326,9 @@ AXIS = "x or y or z or -x or -y or -z or 3 numbers"
         ("left upright=", "upright takes 1 number, got 0"),
         ("left upright=0.1,0.2", "upright takes 1 number, got 2"),
         ("left upright=ten", "upright: 'ten' is not a finite number"),
-        ("left upright=-0.1", "-0.1 is too small, must be above 0 rad"),
+        ("left upright=-0.1", "upright: -0.1 is too small, must be above 0 rad"),
+        ("left upright=10", "upright: 10.0 is too large, must be below 3.14"),
+        ("left upright=0.5 view=1,0,0 view_angle=-1", "view_angle: -1.0 is too small, must be above 0 rad"),
         ("left upright=0.1 upright=0.2", "upright is given twice"),
         ("left upright_axis=z", "upright_axis needs upright, the largest angle from the vertical"),
         ("left upright=0.1 upright_axis=up", f"upright_axis is {AXIS}, got 'up'"),
@@ -350,3 +352,17 @@ def test_waypoints_leave_constraints_to_their_line():
     line: Mapping[str, Any] = {"xyz": (0.2, 0.0, 0.1), "path_constraints": UPRIGHT}
     with pytest.raises(ValueError, match=r"waypoints\.0: path_constraints hold on the whole line: give them beside"):
         CartesianQuery(waypoints=(GoalOptions(**line),))
+
+
+def test_way_out_of_a_contact_keeps_the_constraints(tmp_path):
+    """It leaves the ball only where the tool leaves the region, too."""
+    start = [0.25085444603, 0.35335509529, 1.40027860813, 0.20500151301, -0.89563274577]
+    goal = [-0.40575787931, 0.29684632524, 1.59390914113, 0.28832776768, -1.15110409759]
+    region = (0.23438633664, -0.10106412986, 0.12248742046, 0.2701149042, 0.07227773732, 0.15813899433)
+    ball = WorldObject(Sphere(0.02), Pose(Vector3(0.17380923337, 0.0569797767, 0.16983318834)))
+    planner = make_planner(tmp_path, World({"ball": ball}))
+    request = ask(ConstrainedGoal(JointGoal(ARM, np.array(goal)), PathConstraints(region=region)), np.array(start))
+    message = (
+        "the start is in collision, and no short motion leads out within the path constraints: wrist overlaps ball"
+    )
+    refused(planner, request, PlanCode.START_STATE_IN_COLLISION, message)

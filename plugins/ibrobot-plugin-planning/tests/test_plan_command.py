@@ -127,6 +127,11 @@ def test_no_plan_exits_with_3(yaml: Path):
         (("--from", "up", "--goal", "lft"), PlanningError, "goal 'lft': no pose 'lft'"),
         (("--from", "xyz=0,0,1", "--goal", "left"), PlanningError, "a start is a pose or joints, not a position"),
         (
+            ("--from", "left upright=0.1", "--goal", "left"),
+            PlanningError,
+            "a start has no path constraints; --goal takes upright=0.1",
+        ),
+        (
             ("--from", "up", "--goal", "left", "--mode", "idle"),
             NotSupported,
             "mode idle has no planner: --mode plan",

@@ -141,6 +141,8 @@ def _positions(text: str, robot: Robot) -> Vector:
     parsed = target(text, robot)
     if parsed.tool is not None:
         raise PlanningError(f"--from {text!r}: a start is a pose or joints, not a position of the tool")
+    if parsed.constraints is not None:
+        raise PlanningError(f"--from {text!r}: a start has no path constraints; --goal takes {parsed.constraints.text}")
     return np.array([parsed.joints.get(name, 0.0) for name in robot.joint_names])
 
 

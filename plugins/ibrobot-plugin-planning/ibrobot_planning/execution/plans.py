@@ -8,7 +8,8 @@ from functools import cached_property
 
 import attrs
 import numpy as np
-from ibrobot_kinematics import robot_model
+from ibrobot_kinematics import PathConstraints, robot_model
+from ibrobot_kinematics.path_constraints import KINDS
 
 from ibrobot_core.api import (
     ExecutorGoal,
@@ -147,6 +148,9 @@ class GoalPlans:
             elif mine:
                 goal = JointGoal(tuple(mine), np.array([target.joints[joint] for joint in mine]))
                 parts[name] = goal if target.constraints is None else ConstrainedGoal(goal, target.constraints)
+        constraints = target.tool.constraints if isinstance(target.tool, ConstrainedGoal) else target.constraints
+        if constraints is not None:
+            self._check_constrained(target, constraints, parts)
         if target.tool is None:
             return parts
         arms = [name for name, executor in executors.items() if executor.goals == "trajectory"]
@@ -161,6 +165,28 @@ class GoalPlans:
             both = ", ".join(joint for joint in target.joints if joint in joints)
             raise invalid_goal(f"goal {target.text!r}: {both} moves the tool, and cannot be given beside its position")
         return {arms[0]: target.tool, **parts}
+
+    def _check_constrained(
+        self, target: Target, constraints: PathConstraints, parts: Mapping[str, Goal | float | JointTrajectory]
+    ) -> None:
+        """Check that a way is planned, and that no executor moves the tool to a position without one.
+
+        Raises:
+            PlanningError: if the constraints could not be kept.
+        """
+        model = self.tool.model
+        movers = {model.joint_names[i] for i in model.moving}
+        executors = self._session.config.executors
+        alone = [executors[name].joints[0] for name, part in parts.items() if isinstance(part, float)]
+        wrong = [joint for joint in alone if joint in movers]
+        if not wrong and (target.tool is not None or len(alone) < len(parts)):
+            return
+        which = ", ".join(wrong or alone)
+        key = next(key for key in KINDS if getattr(constraints, key) is not None)
+        raise invalid_goal(
+            f"goal {target.text!r}: {key} holds on a planned way, but {which} goes to its position without a plan:"
+            f" leave {key} out, or give {which} an executor of trajectories with the other joints of the arm"
+        )
 
     def drop(self) -> None:
         """End every search under way, and every wait for the planner, with the code PREEMPTED."""

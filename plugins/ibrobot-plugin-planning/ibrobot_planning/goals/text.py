@@ -182,7 +182,14 @@ def _value(key: str, words: list[str]) -> Any:
     if len(words) != number:
         raise invalid_goal(f"{key} takes {number} number{'s' if number > 1 else ''}, got {len(words)}")
     values = tuple(_number(each, f"{key}: {each!r} is not a finite number") for each in words)
-    return values if number > 1 else values[0]
+    value = values if number > 1 else values[0]
+    field = (attrs.fields_dict(GoalOptions) | attrs.fields_dict(PathConstraints))[key]
+    if field.validator is not None:
+        try:
+            field.validator(None, field, value)
+        except ValueError as error:
+            raise invalid_goal(f"{key}: {error}") from None
+    return value
 
 
 def _angle(joint: str, words: list[str], robot: Robot) -> float:

@@ -198,6 +198,11 @@ class _Plan:
         broken = self.checks.broken(q) if isinstance(self.checks, ConstrainedChecks) else ""
         return broken or sentence(self.checks.contacts(q))
 
+    def _broken(self, positions: Vector) -> bool:
+        """Whether one of the positions, shape (N, J), breaks a path constraint."""
+        checks = self.checks
+        return isinstance(checks, ConstrainedChecks) and checks.first_broken(positions) < len(positions)
+
     def _reach(self, goal: Goal, number: int, way_out: list[Vector], deadline: float) -> PlanResult:
         if isinstance(goal, ConstrainedGoal):
             return self._constrained(goal)._reach(goal.goal, number, way_out, deadline)
@@ -324,14 +329,17 @@ class _Plan:
                 end = np.clip(inside + distance * direction / np.linalg.norm(direction), *self._limits)
                 if self.checks.free(end) and self._leaves(self.start, end):
                     return [self.start, end]
+        within = "" if self._constraints is None else " within the path constraints"
         raise PlanningError(
-            f"the start is in collision, and no short motion leads out: {sentence(touching)}",
+            f"the start is in collision, and no short motion leads out{within}: {sentence(touching)}",
             PlanCode.START_STATE_IN_COLLISION,
         )
 
     def _leaves(self, start: Vector, end: Vector) -> bool:
         """Whether contacts at the start only open on the line to a free end, and no other contact occurs."""
         line = self._space(_FINEST_M).line(start, end)
+        if self._broken(line):
+            return False
         return outwards(self.checks, np.concatenate([start[None], line])) is not None
 
     def _linear(self, goal: LinearGoal) -> PlanResult:
@@ -426,7 +434,7 @@ class _Plan:
     def _touching(self, motion: Motion) -> Vector:
         """Where a motion touches or leaves the limits, shape (N, J)."""
         positions = motion.positions_within(CHECK_S)
-        if isinstance(self.checks, ConstrainedChecks) and self.checks.first_broken(positions) < len(positions):
+        if self._broken(positions):
             self.refused = motion
         lower, upper = self._limits
         # A joint outside its limits may only move inwards.
@@ -436,7 +444,7 @@ class _Plan:
         checked = 0
         if not self.checks.free(self.start):
             out = outwards(self.checks, positions)
-            if out is None:
+            if out is None or self._broken(positions[:out]):
                 return np.asarray(positions[:1])
             checked = out
         while checked < len(positions):
