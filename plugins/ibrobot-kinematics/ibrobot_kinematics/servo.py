@@ -38,7 +38,7 @@ _APPROACH_S = 0.15
 """Least time constant with which the tool approaches the bound of a path constraint [s]."""
 _BRAKING = 1.5
 """The same, as a multiple of the time in which the joints stop."""
-_STOPPING = np.linspace(0.1, 1.0, 10)
+_STOPPING = np.array([0.33, 0.67, 1.0])
 """Parts of the way to a stop at which constraints are checked."""
 _RESERVE = 0.25
 """Share of a constraint's `insides` that stays free at a stop, for the jitter of the steps."""
@@ -349,9 +349,8 @@ class Servo:
         this check accepted a tick before.
         """
         stopping = dt + float(np.max(np.abs(velocity) / self._max_acceleration)) / 2
-        times = np.concatenate([[dt], _STOPPING * (dt + stopping)])
-        way = np.repeat(self.position[None], len(times) + 1, axis=0)
-        way[1:, self._model.moving] += np.multiply.outer(times, velocity)
+        way = np.repeat(self.position[None], len(_STOPPING) + 1, axis=0)
+        way[1:, self._model.moving] += np.multiply.outer(_STOPPING * (dt + stopping), velocity)
         here, *ahead = constraints.excess(way)
         return bool((ahead <= np.maximum(here, -_RESERVE * constraints.insides)).all())
 
