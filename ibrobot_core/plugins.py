@@ -155,15 +155,16 @@ class Registry:
             PluginError: as `find`, or if `make` of the descriptor returns something else or has a bug: any error but an
                 IbrobotError.
         """
+        interfaces = import_module("ibrobot_core.interfaces")
         try:
             made = self.find(kind, type_).make(*arguments)
         except IbrobotError:
             raise
         except Exception as error:
-            name, plugin = getattr(arguments[-1], "name", kind), self.entries[kind, type_].plugin
-            failed = f"{name}: plugin {plugin!r} failed in make of {plugin_type(kind, type_)}"
+            (name,) = [each.name for each in arguments if isinstance(each, interfaces.Context)] or [kind]
+            failed = f"{name}: plugin {self.entries[kind, type_].plugin!r} failed in make of {plugin_type(kind, type_)}"
             raise PluginError(f"{failed}: {describe_bug(error, placed=False)}") from error
-        wanted = vars(import_module("ibrobot_core.interfaces")).get(kind.capitalize(), object)
+        wanted = vars(interfaces).get(kind.capitalize(), object)
         if made is None or not isinstance(made, wanted):
             raise PluginError(f"make of {plugin_type(kind, type_)} returned {made!r}; expected {wanted.__name__}")
         return made
@@ -271,18 +272,17 @@ class Registry:
 
     def not_found(self, kind: str, type_: str) -> PluginError:
         """The error for an unavailable type or command (kind `command`), with the package to install or to repair."""
+        what = plugin_type(kind, type_)
         if packages := self.doubles.get((kind, type_)):
-            both = " and ".join(packages)
-            return PluginError(f"{plugin_type(kind, type_)} is offered by {both}: uninstall all but one of them")
+            return PluginError(f"{what} is offered by {' and '.join(packages)}: uninstall all but one of them")
         package = next((name for name, offers in official_plugins().items() if type_ in offers.get(kind, ())), None)
         for failure in self.failures:
             if failure.package == package:
-                reason = f"{plugin_type(kind, type_)} is not available: {failure}"
-                return PluginNotInstalled(kind, type_, package, reason)
+                return PluginNotInstalled(kind, type_, package, f"{what} is not available: {failure}")
         if package is not None:
             return PluginNotInstalled(kind, type_, package)
         remark = did_you_mean(type_, self.types(kind), "installed")
-        return PluginError(f"unknown {plugin_type(kind, type_)}{remark}{self.broken}")
+        return PluginError(f"unknown {what}{remark}{self.broken}")
 
     @property
     def broken(self) -> str:
@@ -368,7 +368,7 @@ def _offered(manager: pluggy.PluginManager, hook: str, expected: type[Any] | Non
         for field in attrs.fields(type(each)):
             if not isinstance(value := getattr(each, field.name), _CLASSES.get(field.type, object)):
                 raise TypeError(f"{expected.__name__}.{field.alias} must be a {field.type}, not {value!r}")
-        for mistake in getattr(each, "mistakes", tuple)():
+        for mistake in each.mistakes() if isinstance(each, descriptors.Descriptor) else ():
             raise TypeError(f"{expected.__name__} {each.type!r}: {mistake}")
     ((plugin, _),) = manager.list_name_plugin()
     return [attrs.evolve(each, **_contained(each, f"plugin {plugin!r} failed in %s of {hook}: %s")) for each in offers]

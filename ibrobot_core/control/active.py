@@ -90,11 +90,11 @@ class ActiveExecutors:
         self.want_relax = False
         for owned in self._active:
             setpoint = owned.executor.update(owned.reading(measured))
-            if getattr(setpoint, "dtype", None) != np.float64 or setpoint.shape != owned.columns.shape:
-                wanted = f"expected setpoints [rad]: a float64 array of shape ({len(owned.columns)},)"
+            shape = owned.columns.shape
+            if not isinstance(setpoint, np.ndarray) or (setpoint.dtype, setpoint.shape) != (np.float64, shape):
+                wanted = f"expected setpoints [rad]: a float64 array of shape {shape}"
                 raise PluginError(f"{owned.name}: update of {type(owned.executor)} returned {setpoint!r}; {wanted}")
-            if owned.executor.is_stale:
-                setpoint = self._brake(owned, measured)
+            setpoint = self._brake(owned, measured) if owned.executor.is_stale else setpoint
             setpoints.append((owned.columns, setpoint))
             self.want_relax = self.want_relax or owned.executor.wants_relax
             self._report_goals(owned)

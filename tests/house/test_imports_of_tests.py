@@ -22,6 +22,7 @@ ALLOWED = {
     ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.control.commands"): DRIVE,
     ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.interfaces.run_state"): DRIVE,
     ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.plugins"): DRIVE,
+    ("ibrobot-plugin-diagnose/tests/test_causes.py", "ibrobot_core.plugins"): "plugins that are not installed",
     ("ibrobot-plugin-mujoco/tests/pick_loop.py", "ibrobot_core.control.safety"): LOOP,
     ("ibrobot-plugin-planning/tests/test_guard.py", "ibrobot_core.control.safety"): "what calls the guard",
     ("ibrobot-plugin-mujoco/tests/pick_loop.py", "ibrobot_core.dispatch.smoother"): LOOP,

@@ -79,7 +79,19 @@ def test_calibrated_teleoperated_recorded_and_replayed(
     assert zero.returncode == 0, zero.stderr
 
     record = ran(
-        robot, adapter, "record", str(robot), "--mode", "wave", "--headless", "--auto", "--duration", "4", *options
+        robot,
+        adapter,
+        "record",
+        str(robot),
+        "--mode",
+        "wave",
+        "--headless",
+        "--auto",
+        "--duration",
+        "4",
+        "--episodes",
+        "1",
+        *options,
     )
     assert "faults" not in record.stderr, record.stderr
     assert record.returncode == 0, record.stderr

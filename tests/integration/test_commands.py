@@ -250,7 +250,7 @@ JSON = {
     "config check so101 --json": 0,
     "config check BAD --json": 2,
     "plugins --json": 0,
-    "plugins show camera --json": 2,
+    "plugins show kamera --json": 2,
     "plugins show opencv --json": 0,
     "plugins check attrs --json": 2,
     "plugins new teleop my_stick --out new --json": 0,

@@ -176,10 +176,9 @@ def test_a_service_that_is_called_by_name_is_declared() -> None:
 def check_status(status: type[Any], judged: type[Any]) -> None:
     """Look for what the page's scripts read of a recording's state, or say of an episode, that its owner lacks."""
     script = (PAGE / "static/record.js").read_text(encoding="utf-8")
-    taken = ",".join(re.findall(r"(?:(?:words|controls)\(|const )\{(.*?)\}(?:, \{ redo|\)| = episode)", script)).split(
-        ","
-    )
-    read = {*re.findall(r"\bepisode\.(\w+)", script), *(each.partition(":")[0].strip() for each in taken)}
+    taken = re.findall(r"(?:(?:words|controls)\(|const )\{(.*?)\}(?:, \{ redo|, ended\)|\)| = episode)", script)
+    names = ",".join(taken).split(",")
+    read = {*re.findall(r"\bepisode\.(\w+)", script), *(each.partition(":")[0].strip() for each in names)}
     assert len(read) >= 12
     assert read <= set(fields(status)), "record.js reads what the state of a recording does not have"
     cues = re.findall(

@@ -117,7 +117,7 @@ class Servo:
         # From full speed, a joint stops within the margin, unless its acceleration is too low.
         braking = self._max_velocity**2 / (2 * options.joint_limit_margin)
         self._braking = np.minimum(braking, self._max_acceleration)
-        stopping = float((self._max_velocity / self._max_acceleration).max())
+        stopping = float((self._max_velocity / self._max_acceleration).max(initial=0.0))
         self._approach_s = max(_APPROACH_S, _BRAKING * stopping)
         given, middle = options.path_constraints, (model.lower + model.upper) / 2
         self._constraints = None if given is None else ToolConstraints(given, model, middle)

@@ -68,9 +68,12 @@ def _mistakes(cause: object, descriptor: CauseDescriptor) -> Iterator[str]:
     if not isinstance(cause, Cause):
         yield f"make returned {cause!r}, which is no Cause"
         return
+    given = {name: value for base in reversed(type(cause).__mro__) for name, value in vars(base).items()}
+    given |= vars(cause)
     for name in ("name", "title", "remedy"):
-        if not isinstance(value := getattr(cause, name, None), str):
+        if not isinstance(value := given.get(name), str):
             yield f"its {name} is no text: {value!r}"
+            return
     if cause.name != descriptor.type:
         yield f"its name is {cause.name!r}, and the type of its descriptor {descriptor.type!r}: give both one name"
     for name in ("needs", "explains"):

@@ -96,7 +96,7 @@ def _is_identification(folder: Path) -> bool:
     return (folder / REPORT).is_file()
 
 
-@hookimpl
+@hookimpl(optionalhook=True)
 def ibrobot_reports() -> Iterable[ReportDescriptor]:
     """Identifications of arms."""
     contents = "ibrobot_mujoco.identification.contents"
