@@ -158,9 +158,9 @@ class Registry:
         interfaces = import_module("ibrobot_core.interfaces")
         try:
             made = self.find(kind, type_).make(*arguments)
-        except IbrobotError:
-            raise
         except Exception as error:
+            if isinstance(error, IbrobotError):
+                raise
             (name,) = [each.name for each in arguments if isinstance(each, interfaces.Context)] or [kind]
             failed = f"{name}: plugin {self.entries[kind, type_].plugin!r} failed in make of {plugin_type(kind, type_)}"
             raise PluginError(f"{failed}: {describe_bug(error, placed=False)}") from error
@@ -281,8 +281,7 @@ class Registry:
                 return PluginNotInstalled(kind, type_, package, f"{what} is not available: {failure}")
         if package is not None:
             return PluginNotInstalled(kind, type_, package)
-        remark = did_you_mean(type_, self.types(kind), "installed")
-        return PluginError(f"unknown {what}{remark}{self.broken}")
+        return PluginError(f"unknown {what}{did_you_mean(type_, self.types(kind), 'installed')}{self.broken}")
 
     @property
     def broken(self) -> str:
@@ -368,8 +367,9 @@ def _offered(manager: pluggy.PluginManager, hook: str, expected: type[Any] | Non
         for field in attrs.fields(type(each)):
             if not isinstance(value := getattr(each, field.name), _CLASSES.get(field.type, object)):
                 raise TypeError(f"{expected.__name__}.{field.alias} must be a {field.type}, not {value!r}")
-        for mistake in each.mistakes() if isinstance(each, descriptors.Descriptor) else ():
-            raise TypeError(f"{expected.__name__} {each.type!r}: {mistake}")
+        if isinstance(each, descriptors.Descriptor | descriptors.MessageDescriptor):
+            for mistake in each.mistakes():
+                raise TypeError(f"{expected.__name__} {each.type!r}: {mistake}")
     ((plugin, _),) = manager.list_name_plugin()
     return [attrs.evolve(each, **_contained(each, f"plugin {plugin!r} failed in %s of {hook}: %s")) for each in offers]
 

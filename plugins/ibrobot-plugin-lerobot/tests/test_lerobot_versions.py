@@ -27,7 +27,7 @@ def test_other_versions_are_tried_with_a_warning(found: str, monkeypatch: pytest
 def test_lerobot_that_is_not_installed_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(versions, "installed", lambda: None)
     check = versions.check()
-    assert (check.ok, check.matters, check.remedy) == (False, False, "pip install lerobot")
+    assert (check.ok, check.matters, check.remedy) == (False, False, 'pip install "lerobot[dataset,training]"')
 
 
 def test_versions_stand_in_order() -> None:

@@ -55,7 +55,7 @@ def test_world_is_checked_in_modes_whose_planner_knows_none(start: Make, tmp_pat
 
 
 def test_padding_and_floor_of_the_section_goals(start: Make, tmp_path: Path):
-    text = robot_yaml(tmp_path) + "goals: {floor: 0.3}\n"
+    text = robot_yaml(tmp_path) + "goals: {floor: 0.04}\n"
     runtime = start(text=text, mode="idle")
     runtime.step()
     with pytest.raises(PlanningError, match="floor"):
