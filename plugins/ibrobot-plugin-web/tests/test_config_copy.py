@@ -82,8 +82,24 @@ def test_faults_of_the_copy_are_reported(source: Path) -> None:
 
 def test_it_asks_in_a_terminal_for_each_variable(source: Path) -> None:
     with Terminal("config", "copy", "mini.yaml", "desk.yaml") as terminal:
+        terminal.wait_for('port: "${MINI_PORT:/dev/null}"')
         terminal.wait_for("MINI_PORT [/dev/null]")
         terminal.type("/dev/full\r")
         terminal.wait_for("desk.yaml: ok")
         assert terminal.end() == 0
     assert "${MINI_PORT:/dev/full}" in Path("desk.yaml").read_text()
+
+
+def test_a_variable_of_the_environment_is_the_usual_answer_and_outranks_another(
+    source: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MINI_PORT", "/dev/zero")
+    with Terminal("config", "copy", "mini.yaml", "desk.yaml") as terminal:
+        terminal.wait_for("MINI_PORT [/dev/zero]")
+        terminal.type("\r")
+        terminal.wait_for("desk.yaml: ok")
+        assert terminal.end() == 0
+    assert "${MINI_PORT:/dev/zero}" in Path("desk.yaml").read_text()
+    with Terminal("config", "copy", "mini.yaml", "other.yaml", "--value", "MINI_PORT=/dev/full") as terminal:
+        terminal.wait_for("note: MINI_PORT=/dev/zero of the environment outranks the file")
+        assert terminal.end() == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from collections.abc import Mapping
@@ -46,6 +47,11 @@ def variables_of(source: Path) -> dict[str, str]:
     return variables
 
 
+def _line_of(source: Path, name: str) -> str:
+    """The line of a robot YAML with the first use of a variable."""
+    return next(line.strip() for line in _read(source).splitlines() if f"${{{name}" in line.partition(" #")[0])
+
+
 def write_copy(source: Path, copy: Path, defaults: Mapping[str, str]) -> None:
     """Copy a robot YAML, with comments, packages and variables as they are.
 
@@ -85,8 +91,8 @@ class CopyConfig:
     """Copy CONFIG to a file of your own, with your ports and cameras.
 
     The copy has the same text, with its comments. In a terminal, the command asks for the default of each variable,
-    such as ${IBROBOT_FOLLOWER_PORT:/dev/ttyACM0}; the environment still overrides it. `ibrobot doctor` lists what is
-    connected. The copy is checked at the end.
+    such as ${IBROBOT_FOLLOWER_PORT:/dev/ttyACM0}, and shows the line in which it stands; the environment still
+    overrides it. `ibrobot doctor` lists what is connected. The copy is checked at the end.
     """
 
     config: str = option(typed="CONFIG", names="robot", help="robot YAML")
@@ -106,11 +112,17 @@ class CopyConfig:
             if not equals or not value:
                 raise RequestError(f"--value: expected NAME=VALUE, got {each!r}")
             chosen[name] = value
+        variables = variables_of(source)
         if not self.defaults and sys.stdin.isatty():
-            for name, default in variables_of(source).items():
+            for name, default in variables.items():
                 if name not in chosen:
-                    chosen[name] = prompt(f"{name} [{default}]: ", flag="--defaults") or default
+                    usual = os.environ.get(name) or default
+                    echo(_line_of(source, name))
+                    chosen[name] = prompt(f"  {name} [{usual}]: ", flag="--defaults") or usual
         write_copy(source, self.copy, chosen)
+        for name, default in variables.items():
+            if (given := os.environ.get(name)) and given != chosen.get(name, default):
+                echo(f"note: {name}={given} of the environment outranks the file", err=True)
         loaded = load_config(self.copy)
         body = "simulation" if loaded.simulated else "hardware"
         echo(f"{self.copy}: ok ({loaded.robot.name}, {len(loaded.robot.joints)} joints, {body})")
