@@ -36,6 +36,8 @@ from ibrobot_damiao.protocol import (
 
 _ANSWER_S = 0.02
 """How long a request outside the control loop waits for its answer [s]; a motor needs less than 1 ms."""
+_TOGETHER_S = 0.05
+"""How long the answers of several motors with one id are awaited [s], on a busy machine too."""
 _SETTLE_S = 0.1
 """How long an adapter on a serial port is given after it is opened [s]."""
 _BUS_OFF = 0x40
@@ -181,7 +183,7 @@ class DamiaoBus:
         """
         self._drain()
         self.send(REGISTER_ID, Register(motor, FEEDBACK_ID).encode())
-        time.sleep(_ANSWER_S)  # so that a second motor with this id has answered, too
+        time.sleep(_TOGETHER_S)  # so that a second motor with this id has answered, too
         answers = [(message, register) for message in self._queued() if (register := self._of(message, motor))]
         for _ in range(self.retries):
             answers = answers or self._answers(Register(motor, FEEDBACK_ID), motor)

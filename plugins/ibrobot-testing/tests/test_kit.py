@@ -96,7 +96,7 @@ def test_package_has_the_licence_of_ibrobot() -> None:
 
 
 def test_package_that_only_the_tests_need_need_not_be_installed() -> None:
-    project = tomllib.loads(render("recorder", "my_recorder")["pyproject.toml"])["project"]
+    project = tomllib.loads(render("recorder", "another")["pyproject.toml"])["project"]
     assert "ibrobot-plugin-data>=0.1,<0.2" in project["optional-dependencies"]["test"]
 
 
