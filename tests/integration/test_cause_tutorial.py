@@ -13,7 +13,7 @@ from ibrobot_diagnose.cause import KIND, Reference
 from ibrobot_diagnose.diagnosis import diagnose
 from ibrobot_diagnose.testing import make_window
 
-from ibrobot_core.app import Registry
+from ibrobot_core.plugins import Entry, Registry
 
 pytestmark = pytest.mark.integration
 
@@ -56,8 +56,11 @@ def test_diagnosis_tests_it_beside_the_others(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.syspath_prepend(str(EXAMPLE))
     from ibrobot_to_and_fro import ibrobot_causes
 
-    offered = list(ibrobot_causes())
-    monkeypatch.setattr(Registry, "of_kind", lambda self, kind: offered if kind == KIND else [])
+    offered = {
+        (KIND, each.type): Entry(KIND, each, "to_and_fro", "ibrobot-plugin-to-and-fro", "0.1.0")
+        for each in ibrobot_causes()
+    }
+    monkeypatch.setattr("ibrobot_diagnose.diagnosis.installed_plugins", lambda: Registry(offered, []))
     times = np.arange(120) / 30
     window = make_window(0.2 * np.sin(10 * np.pi * times)[:, np.newaxis])
     assert "to_and_fro" in {each.name for each in diagnose(window, Reference()).findings}

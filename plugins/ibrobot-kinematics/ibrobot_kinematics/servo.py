@@ -343,7 +343,7 @@ class Servo:
         return np.asarray(self._weights * np.concatenate([twist.linear, tip.rotation.T @ twist.angular]))
 
     def _stops_within(self, constraints: ToolConstraints, velocity: Vector, dt: float) -> bool:
-        """Whether the arm, if it brakes after a tick at a velocity [rad/s], shape (n,), stops within all bounds.
+        """Whether the arm, if it brakes after a tick at a velocity [rad/s], shape (n,), stops within bounds and limits.
 
         The way to the stop is straight, since all joints brake in proportion. An arm that brakes stays on the way that
         this check accepted a tick before.
@@ -351,6 +351,9 @@ class Servo:
         stopping = dt + float(np.max(np.abs(velocity) / self._max_acceleration)) / 2
         way = np.repeat(self.position[None], len(_STOPPING) + 1, axis=0)
         way[1:, self._model.moving] += np.multiply.outer(_STOPPING * (dt + stopping), velocity)
+        model, begin, end = self._model, way[0], way[-1]
+        if ((end < np.minimum(model.lower, begin)) | (end > np.maximum(model.upper, begin))).any():
+            return False  # a joint that brakes in proportion to the others brakes less than it could
         here, *ahead = constraints.excess(way)
         return bool((ahead <= np.maximum(here, -_RESERVE * constraints.insides)).all())
 

@@ -40,7 +40,7 @@ _LATE = 10
 _OVERRULED_RAD = 1e-3
 """A command that is further from all requests is another's [rad]."""
 _USED_LEAD = 0.7
-"""Share of `max_lead` at which the tool begins to wait. Beyond it, control would hold back one joint, not all."""
+"""Share of `max_lead` at which a tool with path constraints waits. Beyond it, control would hold back one joint."""
 _DIAGNOSTICS = "/diagnostics"
 _PAUSE_NS = ns(0.5)
 """A stream of twists that was silent for so long counts as released [ns]."""
@@ -121,7 +121,8 @@ class TwistTeleop(Teleop):
         if not self.deadman.allows(measured.stamp_ns):
             servo.halt()
         self._heed_command(servo)
-        waits = not self._follows(servo.stop_position(), here, _USED_LEAD)
+        keeps = self._options.path_constraints is not None
+        waits = keeps and not self._follows(servo.stop_position(), here, _USED_LEAD)
         position = servo.step(measured.stamp_ns, waits=waits)
         moves = not servo.at_rest
         if not moves:
