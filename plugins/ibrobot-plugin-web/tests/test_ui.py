@@ -7,6 +7,7 @@ import io
 import os
 import sys
 from collections.abc import Awaitable, Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,14 @@ def test_every_view_has_its_module_for_browsers(tmp_path: Path) -> None:
     run(tmp_path, test)
 
 
+with_all = pytest.mark.skipif(
+    not all(map(find_spec, ("ibrobot_data", "ibrobot_diagnose", "ibrobot_eval", "ibrobot_lerobot", "ibrobot_mujoco"))),
+    reason="needs all packages with commands of the page: uv sync",
+)
+
+
+@pytest.mark.integration
+@with_all
 def test_views_stand_in_groups_in_the_order_of_the_work() -> None:
     groups: dict[str, list[str]] = {}
     for view in views():
@@ -53,6 +62,8 @@ def test_views_stand_in_groups_in_the_order_of_the_work() -> None:
         assert found == ([group] if takes(name) else [])
 
 
+@pytest.mark.integration
+@with_all
 @pytest.mark.parametrize(
     ("command", "within", "group"),
     [("convert", "job-convert", "Learn"), ("", "", "Evaluate"), ("brew", "", "Evaluate")],
