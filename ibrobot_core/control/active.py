@@ -91,7 +91,7 @@ class ActiveExecutors:
         for owned in self._active:
             setpoint = owned.executor.update(owned.reading(measured))
             shape = owned.columns.shape
-            if not isinstance(setpoint, np.ndarray) or (setpoint.dtype, setpoint.shape) != (np.float64, shape):
+            if not isinstance(setpoint, np.ndarray) or setpoint.dtype != np.float64 or setpoint.shape != shape:
                 wanted = f"expected setpoints [rad]: a float64 array of shape {shape}"
                 raise PluginError(f"{owned.name}: update of {type(owned.executor)} returned {setpoint!r}; {wanted}")
             setpoint = self._brake(owned, measured) if owned.executor.is_stale else setpoint

@@ -208,17 +208,17 @@ class ReturnsANumber(Squeaks):
 
 class LikelihoodIsText(Squeaks):
     def test(self, window, reference):
-        return Evidence("A joint squeaks.", 1.0, "joints", 0.5, "high")
+        return Evidence("A joint squeaks.", 1.0, "joints", 0.5, "high")  # type: ignore[arg-type]
 
 
 class NumberIsNone(Squeaks):
     def test(self, window, reference):
-        return Evidence("A joint squeaks.", None, "joints", 0.5, 0.9)
+        return Evidence("A joint squeaks.", None, "joints", 0.5, 0.9)  # type: ignore[arg-type]
 
 
 class DetailsAreText(Squeaks):
     def test(self, window, reference):
-        return Evidence("A joint squeaks.", 1.0, "joints", 0.5, 0.9, details="of the elbow")
+        return Evidence("A joint squeaks.", 1.0, "joints", 0.5, 0.9, details="of the elbow")  # type: ignore[arg-type]
 
 
 class Abstract(Cause):
@@ -226,11 +226,11 @@ class Abstract(Cause):
 
 
 class TitleIsMissing(Squeaks):
-    title = None
+    title = None  # type: ignore[assignment]
 
 
 class NeedsAreText(Squeaks):
-    needs = "commands"
+    needs = "commands"  # type: ignore[assignment]
 
 
 class NeedsSomethingElse(Squeaks):
@@ -238,7 +238,7 @@ class NeedsSomethingElse(Squeaks):
 
 
 class ExplainsATuple(Squeaks):
-    explains = ("plan_dry",)
+    explains = ("plan_dry",)  # type: ignore[assignment]
 
 
 def unfinished():
