@@ -163,8 +163,6 @@ from ibrobot_core.errors import (
     Problem as Problem,
     RequestError as RequestError,
     ComponentFailed as ComponentFailed,
-    InUse as InUse,
-    DiskFull as DiskFull,
     Declined as Declined,
     Unsuccessful as Unsuccessful,
     WireError as WireError,

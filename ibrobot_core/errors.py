@@ -47,6 +47,8 @@ class IbrobotError(Exception):
     """
 
     exit_code = 1
+    from_input = True
+    """Whether invalid input may be the cause, so that `wrong_input` sets the exit code."""
 
     @override
     def __reduce__(self) -> tuple[Any, ...]:
@@ -218,16 +220,8 @@ class RecorderError(IbrobotError):
     """A recording cannot be written or read, e.g. because the disk is full."""
 
 
-class DiskFull(RecorderError):
-    """The disk has less free space than an episode needs."""
-
-
 class DatasetError(IbrobotError):
     """A dataset cannot be written or read, e.g. because the shapes of frames differ."""
-
-
-class InUse(IbrobotError):
-    """An episode or a dataset has another owner, e.g. because it is being recorded."""
 
 
 class GoalRejected(IbrobotError):
@@ -242,6 +236,8 @@ class ComponentFailed(IbrobotError):
         exit_code: exit status of the run that it ends.
     """
 
+    from_input = False
+
     def __init__(self, message: str, exit_code: int = 1) -> None:
         super().__init__(message)
         self.exit_code = exit_code
@@ -254,6 +250,8 @@ class Unsuccessful(IbrobotError):
         result: what the command would return.
         exit_code: the exit code.
     """
+
+    from_input = False
 
     def __init__(self, result: Any = None, exit_code: int = 1) -> None:
         super().__init__()
@@ -269,6 +267,8 @@ class NotSupported(IbrobotError):
 
 class Declined(IbrobotError):
     """The user answered a question with no; earlier steps are not undone."""
+
+    from_input = False
 
     def __init__(self) -> None:
         super().__init__("stopped: the answer was no")
@@ -288,9 +288,7 @@ def wrong_input() -> Iterator[None]:
     try:
         yield
     except IbrobotError as error:
-        if not (
-            isinstance(error, DiskFull | InUse | ComponentFailed | Declined | Unsuccessful) or _is_of_the_machine(error)
-        ):
+        if error.from_input and not _is_of_the_machine(error):
             error.exit_code = ConfigError.exit_code
         raise
 

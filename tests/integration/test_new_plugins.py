@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 
 import pytest
-from ibrobot_kit.new import SAMPLE
+from ibrobot_kit.new import SAMPLE, NewPlugin
 from new_packages import NewPackages, sample_kinds
 
 from ibrobot_core.app import installed_plugins
@@ -23,7 +23,10 @@ def packages(tmp_path_factory: pytest.TempPathFactory) -> NewPackages:
 
 def test_every_kind_has_a_sample() -> None:
     registry = installed_plugins()
-    assert set(registry.all_kinds) - {SAMPLE} <= set(registry.types(SAMPLE))
+    samples = set(registry.types(SAMPLE))
+    assert set(registry.all_kinds) - {SAMPLE} <= samples
+    listed = (NewPlugin.__doc__ or "").partition("KIND is ")[2].partition(". ")[0]
+    assert set(listed.replace(" or ", ", ").replace("\n", " ").replace(" ", "").split(",")) == samples, "as its help says"
 
 
 def test_tests_of_new_packages_pass(packages: NewPackages) -> None:

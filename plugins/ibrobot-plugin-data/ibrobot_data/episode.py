@@ -37,8 +37,9 @@ from ibrobot_core.api import (
     RecorderError,
     Robot,
 )
-from ibrobot_core.app import TASK_KEY, DiskFull, installed_plugins
+from ibrobot_core.app import TASK_KEY, installed_plugins
 from ibrobot_data.commanders import Commanders, is_labelled, stretches
+from ibrobot_data.errors import DiskFull
 from ibrobot_data.growing import GrowingEpisode
 from ibrobot_data.identity import identity
 from ibrobot_data.options import OPERATOR, POLICY

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Literal, get_args, override
 import attrs
 
 from ibrobot_core.api import NS_PER_S, Contract, NotSupported, RecorderError, documented, option, seconds
-from ibrobot_core.app import DiskFull, Episodes, NoRequest, RecordedRun, Service, wrong_input
+from ibrobot_core.app import Episodes, NoRequest, RecordedRun, Service, wrong_input
 from ibrobot_data.conversion import OUTCOMES
 from ibrobot_data.cues import Cue
 from ibrobot_data.episode_dataset import EpisodeDataset, count_complete
 from ibrobot_data.episode_start import is_kept
+from ibrobot_data.errors import DiskFull
 from ibrobot_data.prompt import check_prompt
 
 if TYPE_CHECKING:

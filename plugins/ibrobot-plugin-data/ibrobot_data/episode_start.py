@@ -9,11 +9,11 @@ from pathlib import Path
 from uuid import NAMESPACE_OID, uuid4, uuid5
 
 from ibrobot_calibration.joint_units import calibrations
-from ibrobot_provenance.ownership import Ownership
+from ibrobot_provenance.ownership import InUse, Ownership
 
 import ibrobot_core
 from ibrobot_core.api import MODEL_ANSWERS, Contract, EpisodeStart, ModelAnswer, RecorderError, String
-from ibrobot_core.app import InUse, RecordedRun, RecordingConfig, RobotConfig
+from ibrobot_core.app import RecordedRun, RecordingConfig, RobotConfig
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.options import GUARD, LABELS
 

@@ -7,9 +7,10 @@ from math import inf
 from typing import TYPE_CHECKING, override
 
 from ibrobot_core.api import IbrobotError, NotSupported, OperatorEvent, ViewerDescriptor, seconds
-from ibrobot_core.app import DiskFull, Event, RecordedRun, RunHooks
+from ibrobot_core.app import Event, RecordedRun, RunHooks
 from ibrobot_data.cues import ENDING_S, Cues
 from ibrobot_data.episode_service import RECORD, START, EpisodeService
+from ibrobot_data.errors import DiskFull
 from ibrobot_data.options import has_button
 from ibrobot_data.plural import plural
 from ibrobot_data.recording_session import Session as SessionEvent

@@ -20,7 +20,7 @@ from ibrobot_provenance.jobs import Pool, open_pool
 from ibrobot_provenance.ownership import Ownership
 
 from ibrobot_core.api import Contract, DatasetError, EpisodeAddress, IbrobotError, RecorderError, seconds
-from ibrobot_core.app import DiskFull, installed_plugins, set_malloc
+from ibrobot_core.app import installed_plugins, set_malloc
 from ibrobot_data.commanders import is_labelled
 from ibrobot_data.episode import (
     INTERVENTION,
@@ -35,6 +35,7 @@ from ibrobot_data.episode import (
     unit_key,
     unwanted_outcome,
 )
+from ibrobot_data.errors import DiskFull
 from ibrobot_data.growing import GrowingEpisode
 from ibrobot_data.identity import KnownEpisodes, identity, identity_by_uuid
 from ibrobot_data.provenance import conversion, provenance

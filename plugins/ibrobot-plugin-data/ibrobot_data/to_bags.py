@@ -29,10 +29,11 @@ from ibrobot_core.api import (
     Robot,
     SteppedClock,
 )
-from ibrobot_core.app import DiskFull, installed_plugins
+from ibrobot_core.app import installed_plugins
 from ibrobot_data.episode import stop_if_full
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.episode_start import episode_folder
+from ibrobot_data.errors import DiskFull
 from ibrobot_data.request import EpisodeReport, Report
 from ibrobot_data.run import STAGING, Watch, clear_staging, own_staging, size_of
 

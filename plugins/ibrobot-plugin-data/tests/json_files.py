@@ -11,6 +11,7 @@ from typing import Any, override
 
 import attrs
 import numpy as np
+from ibrobot_data.errors import DiskFull
 from ibrobot_provenance.datasets import DatasetDescriptor, DatasetSummary, DatasetWriter
 
 from ibrobot_core.api import (
@@ -34,7 +35,6 @@ from ibrobot_core.api import (
     TopicSummary,
     hookimpl,
 )
-from ibrobot_core.app import DiskFull
 
 
 def _values(message: Message) -> Any:

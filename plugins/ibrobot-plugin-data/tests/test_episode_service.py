@@ -25,10 +25,11 @@ from ibrobot_data.episode_service import (
     EpisodeService,
     RecordedEpisode,
 )
-from ibrobot_provenance.ownership import Ownership
+from ibrobot_data.errors import DiskFull
+from ibrobot_provenance.ownership import InUse, Ownership
 
 from ibrobot_core.api import Contract, IbrobotError, NotSupported, RecorderError
-from ibrobot_core.app import ESTOP, RESET, ConfigError, DiskFull, InUse, RequestError
+from ibrobot_core.app import ESTOP, RESET, ConfigError, RequestError
 
 if TYPE_CHECKING:
     from fake_runs import Runs

@@ -14,9 +14,9 @@ import pytest
 from ibrobot_lerobot import merge as merging
 from ibrobot_lerobot.options import LeRobotOptions
 from ibrobot_lerobot.writer import LeRobotDatasetWriter
+from ibrobot_provenance.ownership import InUse
 
 from ibrobot_core.api import DatasetError, Feature
-from ibrobot_core.app import InUse
 
 from .conftest import CAMERA, FPS, STATE, check, episodes, rows, values, write
 

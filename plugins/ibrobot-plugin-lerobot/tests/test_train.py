@@ -21,12 +21,13 @@ from ibrobot_lerobot import trainer as lerobot_train
 from ibrobot_lerobot.trainer import arguments, progress
 from ibrobot_lerobot.training import EVENTS, Begin, Progress, Report, TrainOptions
 from ibrobot_lerobot.training_checkpoints import newest_checkpoint
+from ibrobot_provenance.ownership import InUse
 from ibrobot_testing import ibrobot_command
 from ibrobot_testing.command import command_line
 from trainer import install
 
 from ibrobot_core.api import DatasetError, Feature, MissingDependency
-from ibrobot_core.app import InUse, RequestError, Shown, decode_event
+from ibrobot_core.app import RequestError, Shown, decode_event
 
 from .conftest import CAMERA, FPS, rows, write
 

@@ -7,10 +7,9 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from ibrobot_provenance.ownership import Ownership
+from ibrobot_provenance.ownership import InUse, Ownership
 
 from ibrobot_core.api import RecorderError
-from ibrobot_core.app import InUse
 from ibrobot_mcap.reader import Rosbag2Reader, is_rosbag2
 
 TRIMMING, REPAIRING, UNFINISHED, DELETING = ".trimming", ".repairing", ".unfinished", ".deleting"

@@ -9,12 +9,11 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 from ibrobot_mcap import trash
-from ibrobot_provenance.ownership import Ownership
+from ibrobot_provenance.ownership import InUse, Ownership
 from ibrobot_testing.command import command_line
 from killed_process import KILLED, killing
 
 from ibrobot_core.api import RecorderError
-from ibrobot_core.app import InUse
 
 from .conftest import Bench, read, summary
 

@@ -12,12 +12,17 @@ from pathlib import Path
 from typing import override
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import InUse
 
 _LONGEST = 200
 """Longer names are replaced by a hash, since the name of the lock file would be too long [bytes]."""
 _POLL_S = 0.02
 _READ_ONLY = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
+
+
+class InUse(IbrobotError):
+    """An episode or a dataset has another owner, e.g. because it is being recorded."""
+
+    from_input = False
 
 
 class Ownership(AbstractContextManager["Ownership"]):

@@ -10,10 +10,10 @@ import threading
 from pathlib import Path
 
 import pytest
-from ibrobot_provenance.ownership import Ownership, lock_file, owned
+from ibrobot_provenance.ownership import InUse, Ownership, lock_file, owned
 
 from ibrobot_core.api import DatasetError
-from ibrobot_core.app import InUse, wrong_input
+from ibrobot_core.app import wrong_input
 
 HOLD = """
 import sys

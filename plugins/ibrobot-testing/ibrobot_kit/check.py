@@ -66,8 +66,10 @@ def examine(package: str, registry: Registry) -> Iterator[Check]:
         raise RequestError(f"{package} is not installed in this environment") from None
     points = [each for each in installed.entry_points if each.group.partition(".")[0] == "ibrobot"]
     if not points:
+        others = ", ".join(sorted({each.group for each in installed.entry_points}))
         raise RequestError(
-            f"{package} {installed.version} has no entry point in the group `ibrobot`, so it is not a plugin: add "
+            f"{package} {installed.version} has no entry point in the group `ibrobot`"
+            f"{f', only in {others}' if others else ''}, so it is not a plugin: add "
             f"[project.entry-points.ibrobot] to its pyproject.toml, and install it again by {how_to_install('-e', '.')}"
         )
     failures = [failure for failure in registry.failures if failure.package == installed.name]

@@ -42,6 +42,10 @@ class NewPlugin:
 
     The package works as it is: it has options, a small implementation, the conformance suite of its kind, and a robot
     YAML that runs. Change what it does, and keep its tests green.
+
+    KIND is arm_view, camera, cause, command, config, dataset, decoder, detector, device_pose, engine, executor,
+    feature, guard, guide, hardware, message, panel, planner, policy, pool, reader, recorder, report, scene,
+    section, sensor, source, teleop, terminal, transport, units or viewer. Some come with the package that defines them.
     """
 
     kind: str = option(

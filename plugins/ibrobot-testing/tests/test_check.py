@@ -184,6 +184,7 @@ def test_checks_that_need_a_hook_are_listed(site: Site, tmp_path: Path, monkeypa
     [
         ("nobody-has-this", "nobody-has-this is not installed in this environment"),
         ("attrs", "has no entry point in the group `ibrobot`, so it is not a plugin"),
+        ("pytest", "in the group `ibrobot`, only in console_scripts, so it is not a plugin"),
     ],
 )
 def test_what_is_no_plugin_is_an_error(package: str, message: str) -> None:
