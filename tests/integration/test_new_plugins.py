@@ -26,7 +26,9 @@ def test_every_kind_has_a_sample() -> None:
     samples = set(registry.types(SAMPLE))
     assert set(registry.all_kinds) - {SAMPLE} <= samples
     listed = (NewPlugin.__doc__ or "").partition("KIND is ")[2].partition(". ")[0]
-    assert set(listed.replace(" or ", ", ").replace("\n", " ").replace(" ", "").split(",")) == samples, "as its help says"
+    assert set(listed.replace(" or ", ", ").replace("\n", " ").replace(" ", "").split(",")) == samples, (
+        "as its help says"
+    )
 
 
 def test_tests_of_new_packages_pass(packages: NewPackages) -> None:

@@ -59,8 +59,9 @@ class NewPlugin:
         """Write it, completely or not at all."""
         if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", self.name):
             raise RequestError(f"NAME is {self.name!r}: use lower-case letters, digits and _, e.g. my_arm")
-        if keyword.iskeyword(self.name) or find_spec(f"ibrobot_{self.name}") is not None:
-            taken = "a word of Python" if keyword.iskeyword(self.name) else f"ibrobot_{self.name}, which is installed"
+        is_word = keyword.iskeyword(self.name) or self.name in ("null", "true", "false")
+        if is_word or find_spec(f"ibrobot_{self.name}") is not None:
+            taken = "a word of Python or of YAML" if is_word else f"ibrobot_{self.name}, which is installed"
             raise RequestError(f"NAME is {self.name!r}: that is {taken}; choose another")
         folder = self.out / f"ibrobot-plugin-{self.name.replace('_', '-')}"
         if self.out.exists() and not self.out.is_dir():
