@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from ibrobot_core.api import did_you_mean
-from ibrobot_lerobot_devices.registry import KEEPS_TORQUE, third_parties
+from ibrobot_lerobot_devices.packages import KEEPS_TORQUE, third_parties
 from ibrobot_lerobot_devices.units import AXES, POSITION, RADIANS, bases, driven
 
 Kind = Literal["robot", "teleoperator", "camera"]

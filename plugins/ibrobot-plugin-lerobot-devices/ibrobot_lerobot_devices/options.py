@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import attrs
 
-from ibrobot_core.api import OptionFault, Options, documented, not_empty, option
+from ibrobot_core.api import OptionFault, Options, did_you_mean, documented, not_empty, option
 from ibrobot_lerobot_devices.units import UNITS, Choices
 
 if TYPE_CHECKING:
@@ -86,9 +86,10 @@ class RobotOptions(Options):
 
     def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
         """Check them against LeRobot and the robot."""
-        from ibrobot_lerobot_devices.registry import check_robot
+        from ibrobot_lerobot_devices.registry import check_device
 
-        return check_robot(self, robot)
+        yield from check_device("robot", "robot", self.robot, self.config)
+        yield from _check_joints(self, robot)
 
     def devices(self) -> Mapping[str, str]:
         """The serial port, if the config has one."""
@@ -137,9 +138,10 @@ class TeleopOptions(Options):
 
     def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
         """Check them against LeRobot and the robot."""
-        from ibrobot_lerobot_devices.registry import check_teleop
+        from ibrobot_lerobot_devices.registry import check_device
 
-        return check_teleop(self, robot)
+        yield from check_device("teleoperator", "teleop", self.teleop, self.config)
+        yield from _check_joints(self, robot)
 
     def devices(self) -> Mapping[str, str]:
         """The serial port, if the config has one."""
@@ -187,3 +189,16 @@ class CameraOptions(Options):
         from ibrobot_lerobot_devices.registry import check_device
 
         return check_device("camera", "camera", self.camera, self.config)
+
+
+def _check_joints(options: RobotOptions | TeleopOptions, robot: Robot) -> Iterator[OptionFault]:
+    """Check that the options name joints of the robot."""
+    known = robot.joint_names
+    for theirs, ours in options.names.items():
+        if ours not in known:
+            yield OptionFault(("names", theirs), f"unknown joint {ours!r}{did_you_mean(ours, known, 'known')}")
+    kinds = ("anchored", "scaled", "inverted")
+    for key, names in attrs.asdict(options, filter=lambda field, value: field.name in kinds).items():
+        for i, name in enumerate(names):
+            if name not in known and names != GRIPPER:
+                yield OptionFault((key, i), f"unknown joint {name!r}{did_you_mean(name, known, 'known')}")

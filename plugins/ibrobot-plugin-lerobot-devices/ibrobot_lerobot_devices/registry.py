@@ -5,28 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
-from importlib.metadata import Distribution, distributions
+from importlib.metadata import distributions
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import attrs
 from ibrobot_provenance.files import replace_file
 
 from ibrobot_core.api import OptionFault, did_you_mean
 from ibrobot_lerobot_devices.link import INSTALL, DeviceLink, DeviceProblem, is_installed
-from ibrobot_lerobot_devices.options import GRIPPER
+from ibrobot_lerobot_devices.packages import KEEPS_TORQUE, module_of, third_parties
 
-if TYPE_CHECKING:
-    from ibrobot_core.api import Robot
-    from ibrobot_lerobot_devices.options import RobotOptions, TeleopOptions
-
-_PREFIXES = ("lerobot_robot_", "lerobot_teleoperator_", "lerobot_camera_")
-"""LeRobot imports the distributions whose names begin with one of these."""
 _TIMEOUT_S = 90.0
-KEEPS_TORQUE = "disable_torque_on_disconnect"
-"""The key of LeRobot's configs that decides about the torque after the end; here `control.stop` does."""
 _PYTHON: Mapping[str, tuple[type, ...]] = {
     "int": (int,),
     "float": (int, float),
@@ -75,22 +66,11 @@ def _installed() -> str:
     """A fingerprint of LeRobot and the packages that add to it, with their versions."""
     names = {"lerobot", *third_parties(distributions())}
     installed = sorted(
-        (_module(each), each.version, str(each.locate_file(""))) for each in distributions() if _module(each) in names
+        (module_of(each), each.version, str(each.locate_file("")))
+        for each in distributions()
+        if module_of(each) in names
     )
     return hashlib.sha256(json.dumps(installed).encode()).hexdigest()[:16]
-
-
-def third_parties(installed: Iterable[Distribution]) -> list[str]:
-    """The modules of packages that add devices to LeRobot, also of those with dashes, which LeRobot overlooks.
-
-    Not those of ibrobot itself: LeRobot's way to a robot of ibrobot is no way for ibrobot.
-    """
-    names = {_module(each) for each in installed}
-    return sorted(name for name in names if name.startswith(_PREFIXES) and not name.endswith("_ibrobot"))
-
-
-def _module(distribution: Distribution) -> str:
-    return str(distribution.metadata["Name"]).replace("-", "_")
 
 
 def check_device(kind: str, option: str, type_: str, config: Mapping[str, Any]) -> Iterator[OptionFault]:
@@ -145,28 +125,3 @@ def _fits(word: str, value: object) -> bool:
     if isinstance(value, bool) and word != "bool":
         return False
     return isinstance(value, _PYTHON.get(word, (object,)))
-
-
-def check_robot(options: RobotOptions, robot: Robot) -> Iterator[OptionFault]:
-    """Check the options of a robot."""
-    yield from check_device("robot", "robot", options.robot, options.config)
-    yield from check_joints(options, robot)
-
-
-def check_teleop(options: TeleopOptions, robot: Robot) -> Iterator[OptionFault]:
-    """Check the options of a teleoperator."""
-    yield from check_device("teleoperator", "teleop", options.teleop, options.config)
-    yield from check_joints(options, robot)
-
-
-def check_joints(options: RobotOptions | TeleopOptions, robot: Robot) -> Iterator[OptionFault]:
-    """Check that the options name joints of the robot."""
-    known = robot.joint_names
-    for theirs, ours in options.names.items():
-        if ours not in known:
-            yield OptionFault(("names", theirs), f"unknown joint {ours!r}{did_you_mean(ours, known, 'known')}")
-    kinds = ("anchored", "scaled", "inverted")
-    for key, names in attrs.asdict(options, filter=lambda field, value: field.name in kinds).items():
-        for i, name in enumerate(names):
-            if name not in known and names != GRIPPER:
-                yield OptionFault((key, i), f"unknown joint {name!r}{did_you_mean(name, known, 'known')}")

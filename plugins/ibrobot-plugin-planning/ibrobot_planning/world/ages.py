@@ -5,14 +5,16 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Mapping
+from typing import Literal
 
 import attrs
 
 from ibrobot_core.api import Clock, ns, seconds
-from ibrobot_planning.world.options import WhenStale
 
 _FIRST_S = 5.0
 """Goals wait this long after the start for the first message of a cloud [s]."""
+WhenStale = Literal["refuse", "keep", "forget"]
+"""What planners do about a part of the world that is too old: refuse to plan, keep what was seen last, forget it."""
 _THEN: Mapping[WhenStale, str] = {
     "refuse": "plans are refused", "keep": "planners keep what was seen last", "forget": "planners do without it",
 }  # fmt: skip

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import attrs
 
 from ibrobot_core.api import OptionFault, Options, did_you_mean, documented, option
+from ibrobot_planning.world.ages import WhenStale
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
@@ -26,8 +27,6 @@ _KEYS = {
 }
 """Shape -> the keys that it needs."""
 _LONGEST_NAME = 100
-WhenStale = Literal["refuse", "keep", "forget"]
-"""What planners do about a part of the world that is too old: refuse to plan, keep what was seen last, forget it."""
 _RULE = "when it is older: `refuse` plans and stop planned motions, `keep` what was seen last, or `forget` it"
 
 
