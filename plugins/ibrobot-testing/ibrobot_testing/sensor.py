@@ -113,11 +113,15 @@ class SensorSuite(Suite[Sensor]):
                 np.testing.assert_array_equal(value, arrays[name], err_msg=f"{name} changed")
 
     def test_images_are_whole(self) -> None:
-        """An image has `height` rows of `step` bytes, each with room for `width` pixels; a compressed one decodes."""
+        """An image has `height` rows of `step` bytes, each with room for `width` pixels; a compressed one decodes.
+
+        It names the frame of its camera, so that others know where it was taken.
+        """
         with self.opened() as (sensor, ctx):
             image = _decoded(self._next(sensor, ctx))
             if not isinstance(image, Image):
                 pytest.skip("gives no images")
+            assert image.header.frame_id, "names no frame: give its header a frame_id, e.g. NAME_optical_frame"
             assert image.encoding in _BYTES_PER_PIXEL
             assert image.height > 0
             assert image.step >= image.width * _BYTES_PER_PIXEL[image.encoding] > 0

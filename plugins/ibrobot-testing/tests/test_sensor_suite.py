@@ -70,7 +70,7 @@ class StampsAhead(FakeSensor):
 class StampsOnReading(FakeSensor):
     def read(self, timeout_s):
         image = super().read(timeout_s)
-        return image and attrs.evolve(image, header=Header(self._ctx.clock.now_ns()))
+        return image and attrs.evolve(image, header=attrs.evolve(image.header, stamp_ns=self._ctx.clock.now_ns()))
 
 
 class RepeatsTheLastImage(FakeSensor):
@@ -104,6 +104,12 @@ class ShortRows(FakeSensor):
     def read(self, timeout_s):
         image = super().read(timeout_s)
         return image and attrs.evolve(image, step=image.width)
+
+
+class HasNoFrame(FakeSensor):
+    def read(self, timeout_s):
+        image = super().read(timeout_s)
+        return image and attrs.evolve(image, header=Header(image.header.stamp_ns))
 
 
 class CutsItsJpegs(FakeSensor):
@@ -154,6 +160,7 @@ WRONG = {
     IgnoresItsTimeOut: "reading_ends_with_its_time_out",
     ReusesItsBuffer: "messages_stay_as_they_were",
     ShortRows: "images_are_whole",
+    HasNoFrame: "images_are_whole",
     CutsItsJpegs: "images_are_whole",
     OtherCameraInfo: "latched_messages_fit",
     ClosesOnce: "close_is_safe_at_any_time",
@@ -161,7 +168,7 @@ WRONG = {
     ReadsWhileClosed: "refuses_reading_while_closed",
 }
 
-ALONE = {StampsOnReading, IgnoresItsTimeOut}
+ALONE = {StampsOnReading, IgnoresItsTimeOut, HasNoFrame}
 
 
 @pytest.mark.parametrize(("wrong", "caught_by"), WRONG.items(), ids=lambda v: getattr(v, "__name__", v))
