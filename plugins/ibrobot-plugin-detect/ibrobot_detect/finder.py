@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
@@ -13,8 +14,17 @@ from ibrobot_kinematics.run_frames import Frames, UnknownFrame
 from ibrobot_ros2.run_cameras import camera_info, chosen_cameras, next_pictures, rgb
 from numpy.typing import NDArray
 
-from ibrobot_core.api import CameraInfo, CompressedImage, ContractError, Image, Message, SensorError
-from ibrobot_core.app import CONTROL, Component, RunView, Service
+from ibrobot_core.api import (
+    CameraInfo,
+    CompressedImage,
+    ContractError,
+    IbrobotError,
+    Image,
+    Message,
+    SensorError,
+    Vector,
+)
+from ibrobot_core.app import CONTROL, Component, RunView, Service, error_text
 from ibrobot_detect.detector import Detection, Detector, Seen, Sight
 from ibrobot_detect.options import SECTION, DetectOptions, Find, options_of
 
@@ -22,6 +32,12 @@ _GLANCE_S = 0.02
 """Interval at which transforms are looked for [s]."""
 _PLUMB_BOB = 5
 """Numbers of the distortion that are used."""
+_MOST = 1000
+"""Most objects that a detector may find."""
+_FURTHEST_M = 1000.0
+"""Greatest coordinate of an object [m]."""
+_NEARLY_ONE = 1e-3
+"""Allowed deviation of a quaternion's length from 1."""
 
 
 @attrs.frozen
@@ -95,13 +111,36 @@ class Finder(Component):
             raise SensorError(f"camera {wanted.camera}: {without[wanted.camera]}")
         with self._lock:
             objects = [
-                _found(type_, each)
+                each
                 for type_, (detector, pictures) in self._detectors.items()
-                for each in detector.find(wanted.name, [s for s in sights if not pictures or s.pixels is not None])
+                for each in self._found(
+                    type_, detector, wanted.name, [s for s in sights if not pictures or s.pixels is not None]
+                )
             ]
         if wanted.at:
             objects = _at(objects, wanted.camera, wanted.at)
         return Found(tuple(objects), without)
+
+    def _found(self, type_: str, detector: Detector, name: str, sights: Sequence[Sight]) -> list[FoundObject]:
+        """What a detector finds, checked: other packages have detectors, and motions go to what they say.
+
+        Raises:
+            SensorError: if it fails, or breaks its promises.
+        """
+        try:
+            detections = detector.find(name, sights)
+            if not isinstance(detections, Sequence):
+                raise ValueError(f"it has found {detections!r:.80}, must be a list of Detection")
+            if len(detections) > _MOST:
+                raise ValueError(f"it has found {len(detections)} objects, at most {_MOST} are answered")
+            return [_checked(type_, each) for each in detections]
+        except IbrobotError:
+            raise
+        except ValueError as error:
+            raise SensorError(f"detector {type_}: {error}") from error
+        except Exception as error:
+            self._session.log.exception("detector %s failed", type_)
+            raise SensorError(f"detector {type_}: it failed: {error_text(error)}") from error
 
     def _sights(
         self, topics: Mapping[str, str], taken: Mapping[str, Message], frames: Frames, timeout_s: float
@@ -167,12 +206,43 @@ def _picture(message: Message, info: CameraInfo) -> NDArray[np.uint8] | None:
     return colours
 
 
-def _found(detector: str, each: Detection) -> FoundObject:
-    p, q = each.pose.position, each.pose.orientation
-    position = (round(p.x, 5), round(p.y, 5), round(p.z, 5))
-    quaternion = (round(q.x, 6), round(q.y, 6), round(q.z, 6), round(q.w, 6))
-    size = tuple(round(length, 5) for length in each.size_m)
-    return FoundObject(each.name, detector, position, quaternion, size, each.score, each.seen)
+def _checked(detector: str, each: Detection) -> FoundObject:
+    """A detection as the service answers it.
+
+    Raises:
+        ValueError: for one that is not as `Detection` says.
+    """
+    if not isinstance(each, Detection):
+        raise ValueError(f"it has found {each!r:.80}, must be Detection")
+    if not isinstance(each.name, str):
+        raise ValueError(f"its name is {each.name!r:.80}, must be text")
+    try:
+        p, q = each.pose.position, each.pose.orientation
+        place, turn = np.array([p.x, p.y, p.z], float), np.array([q.x, q.y, q.z, q.w], float)
+        size, score = np.array(each.size_m, float).reshape(-1), float(each.score)
+        boxes = {seen.camera: np.array(seen.box_px, float).reshape(4) for seen in each.seen}
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ValueError(f"{each.name!r:.80}: {error}") from error
+    if why := _fault(place, turn, size, score, boxes):
+        raise ValueError(f"{each.name!r:.80}: {why}")
+    x, y, z = np.round(place, 5).tolist()
+    quaternion = tuple(np.round(turn, 6).tolist())
+    seen = tuple(Seen(str(camera), tuple(box.tolist())) for camera, box in boxes.items())
+    return FoundObject(each.name, detector, (x, y, z), quaternion, tuple(np.round(size, 5).tolist()), score, seen)
+
+
+def _fault(place: Vector, turn: Vector, size: Vector, score: float, boxes: Mapping[str, Vector]) -> str:
+    """What is wrong with the numbers of a detection; empty for nothing. NaN fails each comparison."""
+    if not (np.abs(place) <= _FURTHEST_M).all():
+        return f"its pose is not finite, or more than {_FURTHEST_M:g} m away"
+    if not abs(math.hypot(*turn) - 1) <= _NEARLY_ONE:
+        return f"its quaternion has length {math.hypot(*turn):.3g}, must have 1"
+    if not 0 <= score <= 1:
+        return f"its score is {score:g}, must be 0 to 1"
+    if not (np.isfinite(size) & (size >= 0)).all():
+        return "its size is not finite, or negative"
+    beyond = [camera for camera, box in boxes.items() if not np.isfinite(box).all()]
+    return f"its box in the picture of {beyond[0]} is not finite" if beyond else ""
 
 
 def _at(objects: Sequence[FoundObject], camera: str, place: Sequence[float]) -> list[FoundObject]:

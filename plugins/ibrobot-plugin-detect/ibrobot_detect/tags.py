@@ -26,6 +26,8 @@ except ModuleNotFoundError:  # there are no wheels for some processors
 
 _SURE = 100.0
 """Contrast of a tag's cells from which the detector is sure."""
+_LEAST_PX = 16
+"""Least width and height of a picture that can show the cells of a tag; the library crashes on one or two rows."""
 _FLIP = np.diag([1.0, -1.0, -1.0])
 """The frame of the options, y up and z out of the tag, in that of the library, y down and z into it."""
 
@@ -86,6 +88,8 @@ class TagDetector(Detector):
     def _tags(self, sight: Sight) -> list[Any]:
         """The known tags in a picture; those of one size are measured at a time."""
         assert sight.pixels is not None
+        if min(sight.size) < _LEAST_PX:
+            return []
         grey = np.ascontiguousarray(self._straight(sight) @ np.array([0.299, 0.587, 0.114]) + 0.5, dtype=np.uint8)
         k = sight.intrinsics
         centre = (k[0, 2] + 0.5, k[1, 2] + 0.5)  # the library's first pixel reaches from 0 to 1

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_terminal.agent_calls import AskedPath
 
 from ibrobot_core.api import IbrobotError, option
 from ibrobot_core.app import RequestError, confirm, echo
-from ibrobot_mcp.persons import MOVING, ask, running, sockets_folder
+from ibrobot_mcp.persons import ASKED, MOVING, ask, running, sockets_folder
 from ibrobot_mcp.tokens import add_token, named_agents, remove_token
 
 
@@ -72,9 +73,17 @@ class ArmAgent(_OfRun):
         echo(f"{agent} on {path.stem}: for {self.seconds:g} s, {self.speed:.0%} of the speed limits")
         echo(f"services: {', '.join(services)}")
         echo(f"region: {', '.join(self.region) or 'no limits but those of the joints'}")
+        self._show(agent, ask(path, ASKED))
         if not self.yes and not confirm("Let the agent move the robot?", flag="--yes"):
             raise IbrobotError("nothing was granted")
         echo(ask(path, "/agent/arm", grant))
+
+    def _show(self, agent: str, asked: Mapping[str, Any] | None) -> None:
+        """Show what the agent asked for last, and how it would move."""
+        if asked is None or asked["agent"] != agent or not asked["refused"]:
+            return
+        echo(f"it asks for: {asked['service']} {asked['request']}")
+        echo(f"path: {AskedPath(asked['seconds'], asked['path']).at(self.speed)}")
 
     def _chosen(self, connected: Sequence[str]) -> str:
         """The name of the agent in this connection, so that no other one gets the grant that the person agrees to."""

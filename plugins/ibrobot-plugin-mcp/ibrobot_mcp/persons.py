@@ -14,12 +14,15 @@ from typing import Any
 
 import attrs
 from ibrobot_ros2.services import plain
+from ibrobot_terminal.agent_calls import AgentCalls, planned_path
 
 from ibrobot_core.api import IbrobotError, did_you_mean
 from ibrobot_core.app import Grant, RequestError, RunView, error_text
 from ibrobot_mcp.tokens import own_folder
 
 SERVICES = ("/agent/arm", "/agent/disarm", "/agent/status")
+ASKED = "asked"
+"""Instead of a service: what an agent asked for last."""
 _LARGEST = 64 * 1024
 _TIMEOUT_S = 10.0
 _AT_ONCE, _WAITING = 8, 16
@@ -58,6 +61,7 @@ class Persons:
 
     def __init__(self, session: RunView) -> None:
         self._session = session
+        self._calls = AgentCalls(session)
         self.path = sockets_folder() / f"{session.config.robot.name}.{os.getpid()}"
         self.path.unlink(missing_ok=True)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -70,6 +74,7 @@ class Persons:
 
     def close(self) -> None:
         """Stop. Safe to call twice."""
+        self._calls.close()
         for each in (self._socket, *self._open):
             with contextlib.suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)
@@ -94,6 +99,8 @@ class Persons:
         self._open.discard(connection)
 
     def _answer(self, request: Any) -> Any:
+        if isinstance(request, dict) and request.get("service") == ASKED:
+            return {"answer": self._asked()}
         if not isinstance(request, dict) or request.get("service") not in SERVICES:
             return {"error": f"this socket serves {', '.join(SERVICES)}"}
         try:
@@ -105,6 +112,16 @@ class Persons:
         except Exception as error:
             self._session.log.exception("%s failed", request["service"])
             return {"error": f"{request['service']} failed: {error_text(error)}; please report it"}
+
+    def _asked(self) -> Any:
+        """What an agent asked for last, with its path at full speed; None if it asked for nothing."""
+        if (newest := self._calls.newest) is None:
+            return None
+        path = planned_path(self._session, newest)
+        return {
+            "agent": newest.agent, "service": newest.service, "request": newest.request, "refused": newest.refused,
+            "seconds": path.seconds, "path": path.text,
+        }  # fmt: skip
 
 
 def check_services(session: RunView, grant: Any) -> None:

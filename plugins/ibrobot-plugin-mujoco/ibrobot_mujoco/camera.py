@@ -8,6 +8,8 @@ from typing import override
 
 import mujoco
 import numpy as np
+from ibrobot_kinematics.poses import orientation
+from ibrobot_kinematics.urdf import read_urdf
 from ibrobot_ros2.jpeg import to_jpeg
 from numpy.typing import NDArray
 
@@ -21,6 +23,9 @@ from ibrobot_core.api import (
     Sensor,
     SensorError,
     SteppedClock,
+    TFMessage,
+    TransformStamped,
+    Vector3,
     ns,
 )
 from ibrobot_core.app import Subscription
@@ -32,12 +37,15 @@ from ibrobot_mujoco.state import PHYSICS_TOPIC, DrawnWorld, newest, stamp_of
 _QUEUE = 100
 _FURTHEST_M = 10.0
 """Depth beyond this counts as missing, as with real cameras."""
+_OPTICAL = np.diag([1.0, -1.0, -1.0])
+"""An optical frame (x right, y down, z ahead) in MuJoCo's frame of a camera (x right, y up, looks along -z)."""
 
 
 class MujocoCamera(Sensor):
     """Renders in the thread of `open` and `read`. Images that are due too soon are counted and skipped.
 
-    In lockstep, only pictures that have a receiver are rendered; rendering starts with the first of them.
+    In lockstep, only pictures that have a receiver are rendered; rendering starts with the first of them. With each
+    picture comes the camera's pose on `/tf`, if anybody listens, unless the robot YAML has its `transform`.
     """
 
     def __init__(self, options: CameraOptions, ctx: Context) -> None:
@@ -64,6 +72,10 @@ class MujocoCamera(Sensor):
         self._camera = find_camera(self._model, self._options, self._ctx.name)
         self._fovy = math.radians(self._model.cam_fovy[self._camera])
         self._last_slot = None
+        urdf = self._ctx.robot.description.urdf
+        self._base = read_urdf(urdf).root if urdf is not None else "base_link"
+        session = self._ctx.session
+        self._is_placed = session is not None and session.config.peripherals[self._ctx.name].transform is not None
         self._states = bus.subscribe(PHYSICS_TOPIC, _QUEUE)
         if not self._is_idle():
             self._rendering()
@@ -94,6 +106,7 @@ class MujocoCamera(Sensor):
             if self._is_due(stamp_ns) and not self._is_idle():
                 renderer = self._rendering()
                 self._drawn.follow(state)
+                self._publish_pose(stamp_ns)
                 if self._is_depth:
                     return self._depth_image(stamp_ns, renderer.render_depth(self._drawn.data))
                 return self._image(stamp_ns, renderer.render(self._drawn.data))
@@ -118,6 +131,16 @@ class MujocoCamera(Sensor):
         height, width = depth.shape
         millimetres = np.where(depth < _FURTHEST_M, depth * 1000.0 + 0.5, 0.0).astype("<u2")
         return Image(self._header(stamp_ns), height, width, "16UC1", 2 * width, millimetres.reshape(-1).view(np.uint8))
+
+    def _publish_pose(self, stamp_ns: int) -> None:
+        """Publish where the camera is, which only a simulation knows without measuring it."""
+        bus, scene = self._ctx.bus, self._drawn.data
+        if bus is None or self._is_placed or not bus.has_subscribers("/tf"):
+            return
+        turn = scene.cam_xmat[self._camera].reshape(3, 3) @ _OPTICAL
+        base, frame = Header(stamp_ns, self._base), self._header(stamp_ns).frame_id
+        placed = TransformStamped(base, frame, Vector3(*scene.cam_xpos[self._camera].tolist()), orientation(turn))
+        bus.publish("/tf", TFMessage((placed,)))
 
     def _header(self, stamp_ns: int) -> Header:
         return Header(stamp_ns, f"{self._ctx.name}_optical_frame")

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from typing import override
+from types import SimpleNamespace
+from typing import Any, cast, override
 
 import attrs
 import numpy as np
 import pytest
+from ibrobot_kinematics.poses import matrix
 from ibrobot_mujoco.camera import MujocoCamera
 from ibrobot_mujoco.hardware import MujocoHardware
 from ibrobot_mujoco.model import build_spec
@@ -27,8 +29,10 @@ from ibrobot_core.api import (
     EpisodeSetup,
     Float64MultiArray,
     Image,
+    Pose,
     Sensor,
     SensorError,
+    TFMessage,
     Vector,
 )
 from ibrobot_core.app import installed_plugins
@@ -132,6 +136,63 @@ def test_lockstep_renders_what_a_receiver_gets() -> None:
     assert len(set(pictures)) == 1
 
 
+def red_of(image: object) -> np.ndarray:
+    """Rows and columns of the red pixels of a raw picture, shape (N, 2)."""
+    assert isinstance(image, Image)
+    pixels = image.data.reshape(image.height, image.width, 3).astype(int)
+    return np.argwhere((pixels[..., 0] > 2 * pixels[..., 1]) & (pixels[..., 0] > 2 * pixels[..., 2]))
+
+
+@pytest.mark.parametrize("name", ["top", "wrist"])
+def test_pose_of_the_camera_comes_with_its_picture(name: str) -> None:
+    """A cube where the axis of the pose meets the table is in the middle of the picture, also to one side of it."""
+    ctx = watched_context(name)
+    assert ctx.bus is not None
+    camera = MujocoCamera(CameraOptions(width=320, height=240, encoding="raw"), ctx)
+    camera.open()
+    try:
+        publish(ctx, 1)
+        assert camera.read(0) is not None, "nobody listens to /tf"
+        transforms = ctx.bus.subscribe("/tf", 5)
+        publish(ctx, 2 * SLOT_NS)
+        picture = camera.read(0)
+        assert isinstance(picture, Image)
+        (received,) = transforms.drain()
+        assert isinstance(received.message, TFMessage)
+        (placed,) = received.message.transforms
+        assert (placed.header.frame_id, placed.child_frame_id) == ("base_link", picture.header.frame_id)
+        assert placed.header.stamp_ns == picture.header.stamp_ns
+        pose = matrix(Pose(placed.translation, placed.rotation))
+        at, ahead = pose[:3, 3], pose[:3, 2]
+        assert ahead[2] < 0, "it looks down"
+        x, y, _ = at + ahead * (0.0125 - at[2]) / ahead[2]
+        ((_, info),) = camera.latched()
+        assert isinstance(info, CameraInfo)
+        for slot, shift in ((3, (0.0, 0.0)), (4, (0.015, 0.0)), (5, (0.0, 0.015))):
+            publish(ctx, slot * SLOT_NS, cube=(x + shift[0], y + shift[1]))
+            there = np.linalg.inv(pose)[:3] @ (x + shift[0], y + shift[1], 0.0125, 1.0)
+            column, row, _ = info.k.reshape(3, 3) @ (there / there[2])
+            assert np.hypot(*(red_of(camera.read(0)).mean(axis=0) - (row, column))) < 6.0, shift
+    finally:
+        camera.close()
+
+
+def test_pose_that_the_robot_yaml_has_is_left_alone() -> None:
+    mounted = {"top": SimpleNamespace(transform=object())}
+    session = cast("Any", SimpleNamespace(config=SimpleNamespace(peripherals=mounted)))
+    ctx = attrs.evolve(watched_context(), session=session)
+    assert ctx.bus is not None
+    transforms = ctx.bus.subscribe("/tf", 5)
+    camera = MujocoCamera(SMALL, ctx)
+    camera.open()
+    try:
+        publish(ctx, 1)
+        assert camera.read(0) is not None
+        assert transforms.drain() == []
+    finally:
+        camera.close()
+
+
 def test_reading_without_waiting(ctx: Context, camera: MujocoCamera) -> None:
     assert camera.read(0) is None, "nothing was published"
     publish(ctx, 10 * SLOT_NS)
@@ -206,11 +267,8 @@ def test_calibration_projects_the_cube_to_where_it_is_seen(ctx: Context) -> None
         ((_, info),) = camera.latched()
     finally:
         camera.close()
-    assert image is not None
     assert isinstance(info, CameraInfo)
-    pixels = image.data.reshape(480, 640, 3).astype(int)
-    red = (pixels[..., 0] > 2 * pixels[..., 1]) & (pixels[..., 0] > 2 * pixels[..., 2])
-    rows, columns = np.nonzero(red)
+    rows, columns = red_of(image).T
     focal, depth = info.k[0], 0.80 - 0.025  # the camera's height less the cube's top
     assert columns.mean() == pytest.approx(319.5 - focal * (y - 0.04) / depth, abs=3)
     assert rows.mean() == pytest.approx(239.5 - focal * (x - 0.16) / depth, abs=3)

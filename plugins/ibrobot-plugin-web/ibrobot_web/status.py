@@ -13,6 +13,7 @@ from typing import Any, override
 
 import attrs
 import numpy as np
+from ibrobot_terminal.agent_calls import AgentCalls
 
 from ibrobot_core.api import NS_PER_S, JointState, Message, String, Vector
 from ibrobot_core.app import Authority, ControlState, RunView, error_text
@@ -29,9 +30,10 @@ _LEAVES = 64
 _DIGITS = 5
 _NO_VALUES = ("header", "layout")
 """Fields of messages that are not plotted."""
-GO_TO = "/planning/go_to"
-_REQUEST = 300
-"""Longest request of an agent that a page shows, in characters."""
+PLAN = "/planning/plan"
+"""A service that plans to a goal in words, whose path a page draws."""
+_GOAL = 300
+"""Longest goal of an agent that a page plans to, in characters."""
 EPISODE_STATUS = "/record_episode/status"
 
 
@@ -62,38 +64,22 @@ class LogLines(logging.Handler):
             return list(self._lines)
 
 
-class AgentCalls:
-    """What an agent asked for last that would move the robot, so that a person sees it before granting it."""
-
-    def __init__(self, session: RunView) -> None:
-        assert isinstance(session.authority, Authority)
-        self._session, self._authority = session, session.authority
-        self._newest: dict[str, Any] | None = None
-        self._authority.told.append(self._take)
-
-    def close(self) -> None:
-        """Listen no more."""
-        self._authority.told.remove(self._take)
-
-    def json(self) -> dict[str, Any]:
-        """The connected agents, what they may do, and what one asked for."""
-        status = self._authority.status()
-        speed = None if status.grant is None else status.grant.speed
-        return {
-            "connected": list(status.agents), "armed": status.armed, "left_s": math.ceil(status.left_s),
-            "speed": speed, "ended": status.ended, "asked": self._newest,
+def agents_json(session: RunView, calls: AgentCalls) -> dict[str, Any]:
+    """The connected agents, what they may do, and what one asked for."""
+    assert isinstance(session.authority, Authority)
+    status, newest = session.authority.status(), calls.newest
+    asked = None
+    if newest is not None:
+        service, request = newest.plan or ("", {})
+        goal = request["goal"] if service == PLAN and len(request["goal"]) <= _GOAL else ""
+        asked = {
+            "agent": newest.agent, "service": newest.service, "request": newest.request, "refused": newest.refused,
+            "goal": goal,
         }  # fmt: skip
-
-    def _take(self, entry: Mapping[str, Any]) -> None:
-        service = self._session.bus.services().get(entry.get("service", ""))
-        if service is not None and not (service.reads or service.urgent or service.persons):
-            request = str(entry["request"])
-            goal = json.loads(request) if service.name == GO_TO and len(request) < _REQUEST else None
-            goal = goal.get("goal") if isinstance(goal, dict) else goal
-            self._newest = {
-                "agent": entry["agent"], "service": service.name, "request": request[:_REQUEST],
-                "refused": entry["event"] == "refused", "goal": goal if isinstance(goal, str) else "",
-            }  # fmt: skip
+    return {
+        "connected": list(status.agents), "armed": status.armed, "left_s": math.ceil(status.left_s),
+        "speed": None if status.grant is None else status.grant.speed, "ended": status.ended, "asked": asked,
+    }  # fmt: skip
 
 
 def state_json(state: ControlState) -> dict[str, Any]:
@@ -142,7 +128,7 @@ def status_json(session: RunView, log: LogLines, agents: AgentCalls, pages: int)
         "counts": {group: {key: _plain(value) for key, value in values.items()} for group, values in counts.items()},
         "episode": episode_json(session),
         "episodes": session.outcome.episodes, "successes": session.outcome.successes,
-        "pages": pages, "agents": agents.json(), "log": log.lines(), "commander": session.commander,
+        "pages": pages, "agents": agents_json(session, agents), "log": log.lines(), "commander": session.commander,
         "panels": _panels(session),
     }  # fmt: skip
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, override
 
 import attrs
+from ibrobot_terminal.agent_calls import AgentCalls
 
 from ibrobot_core.api import Context, ContractError, IbrobotError, Viewer
 from ibrobot_core.app import Child, ComponentFailed, Pulse, RunView, Subscription, error_text, raise_thread_priority
@@ -22,7 +23,7 @@ from ibrobot_web.messages import Pages, Release, Sent, StopRun, from_server
 from ibrobot_web.objects import SceneObjects, mounts
 from ibrobot_web.options import WebOptions
 from ibrobot_web.pictures import PICTURES, to_payload
-from ibrobot_web.status import AgentCalls, LogLines, episode_json, numbers_of, plan_json, state_json, status_json
+from ibrobot_web.status import LogLines, episode_json, numbers_of, plan_json, state_json, status_json
 
 _MODULE = "ibrobot_web.server.process"
 _START_S = 30.0

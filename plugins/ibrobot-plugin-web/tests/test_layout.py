@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from ibrobot_http.server import HttpServer
+from ibrobot_terminal.agent_calls import AgentCalls
 from ibrobot_testing import make_session
 from ibrobot_web.link import FIRST_PICTURE, JPEG, PICTURE_HEAD, STATE, STATUS
 from ibrobot_web.options import WebOptions
@@ -19,7 +20,7 @@ from ibrobot_web.server.app import make_app
 from ibrobot_web.server.broadcast import Broadcast
 from ibrobot_web.server.drive import Answer, Drive
 from ibrobot_web.server.page_guard import page_guard
-from ibrobot_web.status import AgentCalls, LogLines, status_json
+from ibrobot_web.status import LogLines, status_json
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Header, Image

@@ -17,11 +17,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_ros2.jpeg import to_jpeg
 from ibrobot_terminal import PanelDescriptor
+from ibrobot_terminal.agent_calls import AgentCalls
 from ibrobot_testing import make_session, stand_in
 from ibrobot_web.link import JPEG, PICTURE_HEAD, FrameSender
 from ibrobot_web.objects import SceneObjects
 from ibrobot_web.pictures import as_jpeg, to_payload
-from ibrobot_web.status import AgentCalls, LogLines, numbers_of, plan_json, status_json
+from ibrobot_web.status import LogLines, agents_json, numbers_of, plan_json, status_json
 
 from ibrobot_core.api import (
     Float64MultiArray,
@@ -154,7 +155,7 @@ def test_the_status_has_what_an_agent_asked_for_last_that_moves_the_robot() -> N
     nothing = {"connected": ["1:claude"], "armed": "", "left_s": 0, "speed": None, "ended": "", "asked": None}
     authority.call(agent, "/test/look")
     authority.call(agent, "/estop")
-    assert agents.json() == nothing
+    assert agents_json(session, agents) == nothing
     asked = {"agent": "1:claude", "service": "/planning/go_to", "refused": True}
     requests: list[tuple[Any, str]] = [
         ({"goal": "home"}, "home"), ("rest", "rest"), ({"goal": 3}, ""), ([1], ""), (None, ""), ("x" * 900, ""),
@@ -163,13 +164,13 @@ def test_the_status_has_what_an_agent_asked_for_last_that_moves_the_robot() -> N
     for request, goal in requests:
         with pytest.raises(IbrobotError, match="may not move the robot"):
             authority.call(agent, "/planning/go_to", request)
-        found = agents.json()["asked"]
+        found = agents_json(session, agents)["asked"]
         assert found == {**asked, "goal": goal, "request": json.dumps(request)[:300]}
-    json.dumps(agents.json(), allow_nan=False)
+    json.dumps(agents_json(session, agents), allow_nan=False)
     agents.close()
     with pytest.raises(IbrobotError):
         authority.call(agent, "/planning/go_to", "home")
-    assert agents.json()["asked"] == found
+    assert agents_json(session, agents)["asked"] == found
 
 
 def test_pages_that_only_watch_see_no_token_in_the_log() -> None:

@@ -106,7 +106,7 @@ def _faults(display: RunDisplay) -> list[Text]:
     """The reasons why the robot holds, in full, the newest fault first."""
     session = display.session
     if session.held and not session.faults:
-        return [styled(f"holding after the reset: {session.to_go_on()}", "bold yellow")]
+        return [styled(f"holding: {session.to_go_on()}", "bold yellow")]
     estop = session.state is not None and session.state.estop
     return [
         *([styled("EMERGENCY STOP: F10 resets it", "bold reverse red")] if estop else []),

@@ -13,6 +13,7 @@ from rich.live import Live
 
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import RunDisplay, RunTerminal, Screen
+from ibrobot_terminal.agent_keys import AgentKeys
 from ibrobot_terminal.held_keys import RELEASE, REPEAT
 from ibrobot_terminal.key_reader import KeyReader
 from ibrobot_terminal.panel import GuardBell, RecentLog, kept_apart, panel
@@ -32,7 +33,7 @@ class PanelTerminal(KeyReader, RunTerminal):
 
 
 class Panel(RunDisplay):
-    """The live panel, and the keys of every run: F1..F9 modes, F10 reset."""
+    """The live panel, and the keys of every run: F1..F9 modes, F10 reset, and what a person grants an agent."""
 
     def __init__(self, runtime: Runtime, hooks: RunHooks, stack: ExitStack, *, err: bool) -> None:
         super().__init__(runtime.session)
@@ -40,6 +41,8 @@ class Panel(RunDisplay):
         self._hooks = hooks
         self.log: RecentLog = RecentLog()
         self._live = stack.enter_context(Live(console=Screen(stderr=err), auto_refresh=False, screen=False))
+        self._agents = AgentKeys(runtime.session)
+        stack.callback(self._agents.close)
         self._next_s = 0.0
         self._bell = GuardBell(self._live.console)
         self._pressed: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
@@ -69,7 +72,11 @@ class Panel(RunDisplay):
         self.handle_keys()
         self.sample()
         self._bell.hear(kept_apart(self.session))
-        rows = [*([("now", f"{acting} …")] if (acting := self._acting) else ()), *self._hooks.rows()]
+        rows = [
+            *([("now", f"{acting} …")] if (acting := self._acting) else ()),
+            *self._agents.rows(),
+            *self._hooks.rows(),
+        ]
         self._live.update(panel(self, self.log, self._hooks.help(), rows), refresh=True)
 
     def handle_keys(self) -> None:
@@ -83,6 +90,9 @@ class Panel(RunDisplay):
             session.log.warning("%s was pressed before the emergency stop, which cancels it", key)
             return
         if self._hooks.key(key):
+            return
+        if (act := self._agents.key(key)) is not None:
+            self._act("answering an agent", act)
             return
         if key == "f10":
             self._act("resetting", lambda: self._runtime.reset(stops))

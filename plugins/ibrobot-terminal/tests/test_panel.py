@@ -114,7 +114,7 @@ def test_a_fault_is_shown_in_full_above_the_messages_and_the_mode_until_its_rese
     terminal.run.reset()
     shown = terminal.words()
     assert FAULT not in shown
-    assert "holding after the reset: press F1 to go on with policy" in shown
+    assert "holding: press F1 to go on with policy" in shown
     terminal.run.switch_mode("policy")
     assert "holding" not in terminal.words()
 
@@ -156,7 +156,7 @@ def test_an_emergency_stop_is_shown_with_its_key_until_its_reset(terminal: Termi
     estop(terminal.run)
     shown = terminal.words()
     assert "EMERGENCY STOP: F10 resets it" in shown, "also while the robot holds after a reset"
-    assert "holding after the reset" not in shown
+    assert "holding: press" not in shown
 
 
 def test_a_fault_during_another_is_shown_too(terminal: Terminal):

@@ -12,7 +12,7 @@ import pytest
 from ibrobot_terminal import run_terminal
 from ibrobot_terminal.run_terminal import Panel
 
-from ibrobot_core.app import ESTOP, RunHooks
+from ibrobot_core.app import ESTOP, Authority, RunHooks
 
 if TYPE_CHECKING:
     from fake_runs import Runs
@@ -35,7 +35,9 @@ class Rig:
             request=SimpleNamespace(lockstep=False), stops=0, mode_keys={}, sensors={}, state=None, fail=self._fail
         )
         session.clock = SimpleNamespace(now_ns=lambda: 0)
-        session.bus = SimpleNamespace(latched=dict)
+        session.bus = SimpleNamespace(latched=dict, serves=lambda name: False)
+        session.config = SimpleNamespace(teleoperation={}, robot=None)
+        session.authority = Authority(session)
         runtime: Any = SimpleNamespace(session=session, reset=self._reset)
         self.panel = Panel(runtime, RunHooks(), stack, err=True)
 
