@@ -82,6 +82,7 @@ def summed(came: list[tuple[str, str, Any, float]]) -> dict[str, Result]:
             f"{name:20} {each.commands:7} commands, {each.overruled:6} overruled, {each.changes:4} world changes,"
             f" {each.touched:6} touch; least {1e3 * each.least:8.3f} mm, beyond the margin {1e3 * each.kept:8.3f} mm"
             f" ({each.worst})"
+            + (f"; up to {1e3 * each.nearer:.3f} mm nearer than the path of the commands" if each.nearer else "")
             + (f"; the same commands without the guard: {each.free_touched} of {each.free} touch" if each.free else "")
         )
     for arm in dict.fromkeys(arm for arm, *_ in came):
@@ -144,6 +145,8 @@ def main() -> int:
             continue
         each = sums[what]
         figures |= {what: each.commands, f"{what}_touch": each.touched}
+        if what == "measured":
+            figures |= {"measured_nearer_mm": 1e3 * each.nearer, "measured_touch_unexplained": each.unexplained}
         figures |= {"free": each.free, "free_touch": each.free_touched} if each.free else {}
         if least is not None:
             problems += each.touched > 0 or each.kept < least

@@ -6,6 +6,7 @@ import itertools
 import json
 import logging
 import re
+from collections import deque
 from collections.abc import Iterator, Mapping
 from importlib.metadata import files
 from pathlib import Path
@@ -19,6 +20,7 @@ from ibrobot_mujoco.new_robot import NewRobot
 from ibrobot_planning.guard.changes import WorldChange
 from ibrobot_planning.guard.clearance_guard import ClearanceGuard
 from ibrobot_planning.guard.options import ClearanceGuardOptions
+from ibrobot_planning.world.arm import reach
 from ibrobot_planning.world.checked_arm import may_touch_arm
 from ibrobot_planning.world.objects import Box, WorldObject
 
@@ -35,6 +37,8 @@ MARGIN_M, SELF_MARGIN_M, PRESS_M = 0.003, 0.001, 0.01
 SIZES = {"post": (0.03, 0.03, 0.4), "bar": (0.04, 0.3, 0.04), "wall": (0.02, 0.6, 0.4), "cube": (0.06, 0.06, 0.06)}
 """The objects; they come, move and go."""
 FAR_M = 50.0
+FOLLOWED_S = 0.5
+"""A joint is on the path of its commands if it is where one of the last ones was; as in the guard."""
 FREE = 10
 """Of every so many seeds, the commands are also sent past the guard."""
 HANDS = ("gripper", "moving_jaw_so101_v1", "camera_mount")
@@ -210,9 +214,9 @@ class Loop:
             self.guard.world(change.message())
 
     @property
-    def rest(self) -> Vector:
-        """Where the arm comes to rest if it brakes now."""
-        return self.safety.rest
+    def way(self) -> list[Vector]:
+        """From where the arm is to where it comes to rest if it brakes now: what appears there cannot be avoided."""
+        return [self.position + share * (self.safety.rest - self.position) for share in np.linspace(0, 1, 16)]
 
     @property
     def overruled(self) -> str:
@@ -240,13 +244,20 @@ class ControlLoop:
         self._control = InlineControl(self._config, installed_plugins(), self._clock, 0, self._state, self._event)
         self._control.start()
         self._generation = int(self._control.call(GetCounters())["generation"])
+        self.commands: deque[Vector] = deque(maxlen=round(FOLLOWED_S / 0.01))
+        """The last ones: the path on which a joint may lag."""
+        arm = may_touch_arm(self._config.robot, LOG)
+        self._reach = reach(arm, ())
         self.tick(None)
 
     @property
-    def rest(self) -> Vector:
-        """At most a brake's way from here."""
-        way, robot = self.position - self._before, self._config.robot
-        return self.position + way * np.abs(way) / (2 * robot.max_acceleration * 0.01**2)
+    def way(self) -> list[Vector]:
+        """From where the joints are, behind their commands, to where these come to rest if they brake now."""
+        step, robot = self.position - self._before, self._config.robot
+        rest = self.position + step * np.abs(step) / (2 * robot.max_acceleration * 0.01**2)
+        commands = list(self.commands)
+        behind = int((np.abs(np.array(commands) - self.measured) @ self._reach).argmin())
+        return [self.measured, *commands[behind:], *np.linspace(self.position, rest, 16)]
 
     def world(self, change: WorldChange) -> None:
         """Tell the guard."""
@@ -270,6 +281,7 @@ class ControlLoop:
     def _state(self, state: ControlState) -> None:
         self._before = getattr(self, "position", state.command)
         self.position, self.measured = state.command.copy(), state.position.copy()
+        self.commands.append(self.position)
 
     def _event(self, event: Mapping[str, Any]) -> None:
         if event["event"] == "guard":
@@ -368,6 +380,10 @@ class Result:
     """The same commands that were also sent past the guard."""
     free_touched: int = 0
     """Those of them that touch."""
+    nearer: float = 0.0
+    """How much nearer to one another than on the path of their commands the joints have led a pair, at most [m]."""
+    unexplained: int = 0
+    """Samples that touch deeper than that."""
 
     def add(self, other: Result) -> None:
         """Count in what another one counted."""
@@ -377,6 +393,8 @@ class Result:
         self.changes += other.changes
         self.free += other.free
         self.free_touched += other.free_touched
+        self.unexplained += other.unexplained
+        self.nearer = max(self.nearer, other.nearer)
         if other.kept < self.kept:
             self.worst = other.worst
         self.least, self.kept = min(self.least, other.least), min(self.kept, other.kept)
@@ -453,8 +471,7 @@ def _commanded(
     for tick in range(ticks):
         if tick % 100 == 0:
             # Where an object appears, the arm can brake: what is nearer is the concern of another trial.
-            ahead = [loop.position + share * (loop.rest - loop.position) for share in np.linspace(0, 1, 8)]
-            after = changed(station, judge, ahead, rng)
+            after = changed(station, judge, loop.way, rng)
             if after is None:
                 judge.put(known)
             else:
@@ -478,7 +495,13 @@ def _commanded(
         where = f"{station.name}, seed {seed}, tick {tick}, {kind}"
         result.note(judge.along(before, now), where)
         if measured is not None and isinstance(loop, ControlLoop):
-            measured.note(judge.along(was, loop.measured), where)
+            room = judge.along(was, loop.measured)
+            measured.note(room, where)
+            nearer = 0.0
+            if room[0] < station.seen:
+                nearer = min(judge.room(command)[0] for command in loop.commands) - room[0]
+            measured.nearer = max(measured.nearer, nearer)
+            measured.unexplained += room[0] < -nearer
             if loop.faults:  # e.g. a joint does not follow, since the hand presses on the table
                 break
     return result
@@ -491,8 +514,7 @@ def appears(station: Station, judge: Judge, seed: int) -> str:
     """
     rng = np.random.default_rng(seed)
     loop, goal, name = _moving(station, judge, rng)
-    braking = [loop.position + share * (loop.rest - loop.position) for share in np.linspace(0, 1, 16)]
-    could = min(judge.room(q)[1] for q in braking)
+    could = min(judge.room(q)[1] for q in loop.way)
     loop.world(WorldChange(judge.objects))
     said, label = False, ""
     for tick in range(150):

@@ -79,6 +79,12 @@ CLAIMS = (
         "guard_experts.py --episodes 5",
     ),
     Claim(
+        "guard_cost",
+        "with the guard and 20 objects around the arm, the p99 of the loop's lateness is at most 1.3 times as large",
+        "docs/explanation/safety.md",
+        "guard_cost.py --parts lateness checks --pairs 8",
+    ),
+    Claim(
         "stop_under_limits",
         "without memory, threads, files or disk, a stop is answered or the run has ended, at rest within 0.5 s",
         "docs/explanation/safety.md",

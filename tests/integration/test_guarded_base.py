@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from ibrobot_planning.guard.joints import BaseWays
 from ibrobot_planning.world.objects import Box, WorldObject
 from plugin_tests import of_tests
 
-from ibrobot_core.api import Pose, Vector, Vector3
+from ibrobot_core.api import HardwareError, Pose, Vector, Vector3
 from ibrobot_core.app import ConfigError, installed_plugins, load_config
 from ibrobot_core.control.commands import ChangeWorld
 
@@ -197,3 +199,117 @@ def test_a_base_that_is_none_is_refused(tmp_path: Path, base: Mapping[str, Any],
     path.write_text(yaml.safe_dump(document), encoding="utf-8")
     with pytest.raises(ConfigError, match=rf"wheels\.yaml:\d+: control\.guard\.{fault}"):
         load_config(path, sim=False)
+
+
+def test_clouds_around_a_guarded_base_are_refused(tmp_path: Path) -> None:
+    """Their cells are where the base is now, and the world of the guard where it was at the start."""
+    path = tmp_path / "wheels.yaml"
+    document = yaml.safe_load(driving.DOCUMENT) | {"control": {"guard": CLEARANCE}}
+    document["hardware"] = {"type": "lerobot", "robot": "lekiwi", "units": {}}
+    document["world"] = {"clouds": {"lidar": {"topic": "/points"}}}
+    path.write_text(yaml.safe_dump(document), encoding="utf-8")
+    fault = r"wheels\.yaml:\d+: world\.clouds\.lidar: clouds are in the frame of the base, which drives: leave it out"
+    with pytest.raises(ConfigError, match=fault):
+        load_config(path, sim=False)
+    del document["world"]["clouds"]
+    path.write_text(yaml.safe_dump(document), encoding="utf-8")
+    load_config(path, sim=False)
+
+
+WRONG = (np.nan, np.inf, -np.inf, 1e308, -1e308)
+
+
+def hostile_twists(drive: Any, rng: np.random.Generator) -> Iterator[None]:
+    """Of numbers that are none, too fast, and to and fro."""
+    for wrong, axis in itertools.product(WRONG, range(3)):
+        twist = driving.FASTEST * rng.uniform(-1, 1, 3)
+        twist[axis] = wrong
+        drive.drive(twist, 0.3)
+        yield
+    for _ in range(15):
+        for _ in range(8):
+            drive.twist = driving.FASTEST * rng.choice([-9.0, -1.0, 1.0, 9.0], 3)
+            drive.tick(rng.uniform(0.01, 0.2))
+        yield
+
+
+def hostile_readings(drive: Any, rng: np.random.Generator) -> Iterator[None]:
+    """Readings of single axes that are none, for a while shorter than a fault takes."""
+    for fault, axis in itertools.product(("nan", "inf", "-inf", "huge", "missing"), range(3)):
+        drive.drive(driving.FASTEST * rng.uniform(-1, 1, 3), 0.4)
+        drive.world.fault, drive.world.axis = fault, axis
+        drive.tick(0.05)
+        drive.world.fault = ""
+        drive.tick(0.4)
+        if drive.core.fault:
+            assert drive.reset()
+        yield
+
+
+def hostile_wheels(drive: Any, rng: np.random.Generator) -> Iterator[None]:
+    """Wheels that reach a share of their velocity that changes all the time, or none."""
+    for _ in range(30):
+        drive.twist = driving.FASTEST * rng.uniform(-1, 1, 3)
+        for _ in range(6):
+            drive.world.wheels.share = rng.choice([0.0, 0.3, 0.8, 1.0, 1.1])
+            drive.tick(0.1)
+        if drive.core.fault:
+            drive.world.wheels.share = 1.0
+            assert drive.reset()
+            drive.drive(driving.FASTEST * rng.uniform(-1, 1, 3), 0.1)
+        yield
+
+
+def hostile_worlds(drive: Any, rng: np.random.Generator) -> Iterator[None]:
+    """Malformed changes, objects that carry names of the model, floods, and others that come and go far away."""
+    far = box(30.0, 30.0)
+    right = WorldChange({"far": far}).message()
+    for number in range(60):
+        drive.twist = driving.FASTEST * rng.uniform(-1, 1, 3)
+        drive.tick(0.1)
+        wrong: Any = WRONG[number % len(WRONG)]
+        thing = dict(right["changed"]["far"])
+        messages: list[Any] = [
+            {"changed": {"far": {**thing, "pose": [wrong, 0, 0, 0, 0, 0, 1]}}},
+            {"changed": {"far": {**thing, "shape": ["box", [0.1, wrong, 0.1]]}}},
+            {"changed": {"far": {**thing, "link": "gripper"}}},
+            {"changed": {"base": thing, "world": thing}},
+            {"changed": {f"far{each}": thing for each in range(100)}},
+            {"removed": ["base", "world", "far", *(f"far{each}" for each in range(100))]},
+            {"moved": {"box0": [0, 0, wrong, 0, 0, 0, 1]}},
+            {"moved": {"nothing": [0, 0, 0, 0, 0, 0, 1]}, "removed": ["nothing"]},
+            None,
+        ]
+        with contextlib.suppress(HardwareError, AttributeError):
+            drive.core.handle(ChangeWorld(messages[number % len(messages)]))
+        yield
+
+
+def hostile_stops(drive: Any, rng: np.random.Generator) -> Iterator[None]:
+    """Stops and resets in motion, and a program that falls silent."""
+    for number in range(30):
+        drive.drive(driving.FASTEST * rng.uniform(-1, 1, 3), rng.uniform(0.1, 0.8))
+        if number % 3:
+            drive.stop()
+            drive.tick(rng.uniform(0.01, 0.6))
+            assert drive.reset()
+        else:
+            drive.twists = False
+            drive.tick(0.5)
+            drive.twists = True
+        yield
+
+
+ATTACKS = (hostile_twists, hostile_readings, hostile_wheels, hostile_worlds, hostile_stops)
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_a_base_that_is_attacked_touches_nothing(monkeypatch, attack) -> None:
+    """Among four boxes from which there is no way far away; each attack has 15 siblings or more."""
+    boxes = {f"box{number}": box(*place) for number, place in enumerate(((0.6, 0), (-0.6, 0), (0, 0.65), (0, -0.65)))}
+    drive, judge = start(monkeypatch, boxes)
+    count = sum(1 for _ in attack(drive, np.random.default_rng(47)))
+    assert count >= 15
+    assert judge.driven > 0.5, "it has not been held all the time"
+    assert judge.nearest > MARGIN_M - _OFF_M
+    drive.close()

@@ -27,6 +27,7 @@ from ibrobot_planning.world.checked_arm import may_touch_arm
 from ibrobot_planning.world.objects import (
     OBSERVED,
     Box,
+    Boxes,
     Mesh,
     ObservedWorld,
     Plane,
@@ -429,18 +430,19 @@ def make_change(kind: str) -> WorldObject:
         "sphere": Sphere(0.1),
         "plane": Plane(),
         "mesh": Mesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.5]]), np.array([[0, 1, 2]])),
+        "boxes": Boxes(np.full((2, 3), 0.1), np.tile(np.concatenate([np.zeros((1, 3)), np.eye(3)]), (2, 1, 1))),
         "voxels": Voxels(0.02, np.array([[0, 0, 0], [4, -3, 2]])),
         "far voxels": Voxels(0.02, np.array([[0, 0, 0], [40_000, -3, 2]])),
     }[kind]
     return WorldObject(shape, Pose(Vector3(0.1, 0.2, 0.3)), None, ("a", "b"))
 
 
-@pytest.mark.parametrize("kind", ["box", "sphere", "plane", "mesh", "voxels", "far voxels"])
+@pytest.mark.parametrize("kind", ["box", "sphere", "plane", "mesh", "boxes", "voxels", "far voxels"])
 def test_a_change_of_the_world_survives_the_way_to_control(kind: str) -> None:
     thing = make_change(kind)
-    sent = WorldChange({"it": thing}, ("gone",), "too old")
+    sent = WorldChange({"it": thing}, ("gone",), "too old", {"other": thing.pose})
     read = WorldChange.read(json.loads(json.dumps(sent.message())))
-    assert (read.removed, read.stale) == (sent.removed, sent.stale)
+    assert (read.removed, read.stale, read.moved) == (sent.removed, sent.stale, sent.moved)
     assert json.dumps(read.message()) == json.dumps(sent.message())
 
 
@@ -461,6 +463,13 @@ WRONG = [
     written(["voxels", 0.1, "AAAA", "<f8"]),
     written(["sphere", -1.0]),
     written(["mesh", "", "", False]),
+    written(["boxes", "", ""]),
+    written(["boxes", "AAAA", "AAAA"]),
+    {"moved": {"wall": [0, 0, 0]}},
+    {"moved": {"wall": [0, 0, math.nan, 0, 0, 0, 1]}},
+    {"moved": {"wall": [0, 0, 1e4, 0, 0, 0, 1]}},
+    {"moved": {"wall": [0, 0, 0, 0, 0, 0, 0]}},
+    {"moved": ["wall"]},
 ]
 
 
@@ -607,7 +616,9 @@ def spoiled() -> Iterator[tuple[str, Any]]:
         name: {"shape": shape, "pose": [1, 1, 1, 0, 0, 0, 1], "link": None, "may_touch": links}
         for name, shape, links in (("it", ["box", [0.1, 0.1, 0.1]], ["hand"]), ("cloud", cloud, []))
     }
-    right = {"changed": things, "removed": ["gone"], "stale": ""}
+    boxes = WorldChange({"boxes": make_change("boxes")}).message()["changed"]
+    moved = {"boxes": [1, 1, 1, 0, 0, 0, 1]}
+    right = {"changed": {**things, **boxes}, "removed": ["gone"], "stale": "", "moved": moved}
 
     def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         yield path
@@ -645,8 +656,8 @@ def test_messages_of_every_kind_neither_break_the_loop_nor_lose_the_wall(tmp_pat
         before = loop.position
         nearest = min(nearest, seen.along(before, loop.tick(ACROSS)))
         assert np.isfinite(loop.position).all()
-        loop.guard.world({"changed": {}, "removed": ["it", "cloud"], "stale": ""})
-    assert (tried, refused > 400) == (702, True)
+        loop.guard.world({"changed": {}, "removed": ["it", "cloud", "boxes"], "stale": ""})
+    assert (tried, refused > 400) == (1188, True)
     assert nearest > MARGIN_M - 0.001
     assert loop.go(ACROSS)[0] > 0
 

@@ -16,7 +16,7 @@ from ibrobot_planning.guard.changes import WorldChange
 from ibrobot_planning.guard.pairs import Pairs
 from ibrobot_planning.world.arm import Arm
 from ibrobot_planning.world.coal_shapes import geometry
-from ibrobot_planning.world.objects import Voxels, World
+from ibrobot_planning.world.objects import Boxes, Voxels, World
 
 _MOST_WAITING = 32
 """Worlds that wait for a loop that takes none, e.g. since the robot holds after a fault; then one takes their place."""
@@ -105,18 +105,17 @@ class Building:
         stale = changes[-1].stale
         try:
             world = self._permit(world)
-            moved = WorldChange.between(self._made, world).only_moved(self._made)
+            change = WorldChange.between(self._made, world)
             if len(self.finished) >= _MOST_WAITING:
                 self._pairs = self._make(world, None)
                 self.finished.clear()
                 self.finished.append(Finished(stale, self._pairs))
-            elif moved is None:
+            elif change.only_moves(world):
+                self._pairs.note_moved({name: world.objects[name] for name in change.moved})
+                self.finished.append(Finished(stale, None, tuple(change.moved.items())))
+            else:
                 self._pairs = self._make(world, self._pairs)
                 self.finished.append(Finished(stale, self._pairs))
-            else:
-                places = tuple((name, world.objects[name].pose) for name in moved)
-                self._pairs.note_moved({name: world.objects[name] for name in moved})
-                self.finished.append(Finished(stale, None, places))
         except Exception as error:  # noqa: BLE001 - whatever it is, the loop must know that the world is another one
             self._log.exception("the guard cannot take in the world")
             self.finished.append(Finished(f"the guard cannot take it in: {type(error).__name__}: {error}"))
@@ -127,7 +126,7 @@ class Building:
         thing = change.changed[name]
         try:
             World({name: thing}).check(self._arm.frames)
-            if not isinstance(thing.shape, Voxels):
+            if not isinstance(thing.shape, Voxels | Boxes):
                 geometry(thing.shape)
         except (PlanningError, ValueError, RuntimeError) as error:
             self.refused += 1

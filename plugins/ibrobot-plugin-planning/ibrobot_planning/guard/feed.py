@@ -6,6 +6,7 @@ from typing import override
 
 from ibrobot_core.app import CONTROL, RunView, SessionWorker
 from ibrobot_planning.guard.changes import WorldChange
+from ibrobot_planning.guard.meshes import Meshes
 from ibrobot_planning.guard.notice import say, say_whether_it_acted
 from ibrobot_planning.world.objects import World, observed_world
 
@@ -21,6 +22,7 @@ class GuardFeed(SessionWorker):
     def __init__(self, session: RunView) -> None:
         super().__init__(session, "guard", "tells the guard of changes of the world", (CONTROL, "world"))
         self._sent, self._stale = World(), ""
+        self._meshes = Meshes()
 
     @override
     def setup(self) -> None:
@@ -40,8 +42,9 @@ class GuardFeed(SessionWorker):
     def _update(self) -> None:
         observed = observed_world(self.session.bus)
         stale = "" if observed.is_awaited else observed.refusal
-        if observed.world == self._sent and stale == self._stale:
+        world = self._meshes.simple(observed.world)
+        if world == self._sent and stale == self._stale:
             return
-        for part in WorldChange.between(self._sent, observed.world, stale).parts(_MOST):
+        for part in WorldChange.between(self._sent, world, stale).parts(_MOST):
             self.session.change_world(part.message())
-        self._sent, self._stale = observed.world, stale
+        self._sent, self._stale = world, stale

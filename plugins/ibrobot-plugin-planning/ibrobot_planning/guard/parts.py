@@ -15,9 +15,9 @@ from ibrobot_kinematics.poses import matrix
 from ibrobot_core.api import Vector
 from ibrobot_planning.world.arm import Arm, LinkShape, Pair
 from ibrobot_planning.world.checked_arm import link_hulls
-from ibrobot_planning.world.coal_shapes import geometry, hull
+from ibrobot_planning.world.coal_shapes import boxes, geometry, hull
 from ibrobot_planning.world.collision import Engine, checked_pairs, object_shapes
-from ibrobot_planning.world.objects import Box, Voxels, World, WorldObject
+from ibrobot_planning.world.objects import Box, Boxes, Voxels, World, WorldObject
 
 _MOST = 16
 """Objects of a part, or blocks of cells: one call that makes a part takes no longer, and the loop waits for calls."""
@@ -152,7 +152,10 @@ def parts(moving: Moving, standing: Mapping[str, WorldObject], before: Sequence[
     for part in before:
         if not all(name in left and _alike(left[name], thing) for name, thing in part.objects.items()):
             continue
-        if any(isinstance(thing.shape, Voxels) for thing in part.objects.values()) or len(part.objects) == _MOST:
+        if (
+            any(isinstance(thing.shape, Voxels | Boxes) for thing in part.objects.values())
+            or len(part.objects) == _MOST
+        ):
             made.update(part.objects)
             yield part
         else:
@@ -161,7 +164,7 @@ def parts(moving: Moving, standing: Mapping[str, WorldObject], before: Sequence[
     for name, thing in left.items():
         if name in made:
             continue
-        if isinstance(thing.shape, Voxels):
+        if isinstance(thing.shape, Voxels | Boxes):
             for blocks in batched(_blocks(thing.shape), _MOST):
                 yield Part(moving.coarse or moving, {name: thing}, [(name, *block) for block in blocks])
         else:
@@ -180,11 +183,13 @@ def _alike(a: WorldObject, b: WorldObject) -> bool:
     return a == b
 
 
-def _blocks(cloud: Voxels) -> Iterator[tuple[Any, Vector]]:
-    """Shapes of Coal that contain the cells, neighbours in one, each with its place in the frame of the cloud.
+def _blocks(shape: Voxels | Boxes) -> Iterator[tuple[Any, Vector]]:
+    """Shapes of Coal that together contain one, each with its place in the frame of the object."""
+    return _blocks_of_cells(shape) if isinstance(shape, Voxels) else boxes(shape)
 
-    A convex shape takes a fiftieth of the time of an octree.
-    """
+
+def _blocks_of_cells(cloud: Voxels) -> Iterator[tuple[Any, Vector]]:
+    """Neighbouring cells in one shape; a convex one takes a fiftieth of the time of an octree."""
     edge, cells = _BLOCK, np.unique(cloud.cells, axis=0)
     while True:
         _, which = np.unique(cells // edge, axis=0, return_inverse=True)

@@ -15,7 +15,7 @@ from ibrobot_core.api import Pose, Robot, Vector, Vector3
 from ibrobot_planning.guard.options import ClearanceGuardOptions, RegionOptions
 from ibrobot_planning.world.arm import Arm, Pair, sorted_pair
 from ibrobot_planning.world.coal_shapes import enclosing, geometry
-from ibrobot_planning.world.objects import FLOOR, Mesh, Plane, Voxels, World, WorldObject
+from ibrobot_planning.world.objects import FLOOR, Boxes, Mesh, Plane, Voxels, World, WorldObject
 
 _ROUNDING_M = 1e-6
 """How far an object in a region may reach beyond it [m]."""
@@ -105,6 +105,8 @@ def _points(thing: WorldObject) -> Vector | None:
             return np.asarray(cells.centres[:, None] + _CORNERS * cells.size)
         case Mesh() as mesh:
             return mesh.vertices[None]
+        case Boxes() as several:
+            return several.corners
         case shape:
             points = enclosing(geometry(shape))
             return None if points is None else points[None]

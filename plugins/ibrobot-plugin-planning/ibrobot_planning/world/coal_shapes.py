@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import coal
 import numpy as np
 
 from ibrobot_core.api import Vector
-from ibrobot_planning.world.objects import Box, Capsule, Cylinder, Mesh, Plane, Shape, Sphere, Voxels
+from ibrobot_planning.world.objects import Box, Boxes, Capsule, Cylinder, Mesh, Plane, Shape, Sphere, Voxels
 
 type Triangles = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 
 
 def geometry(shape: Shape) -> Any:
-    """A coal.CollisionGeometry, in the frame of the shape."""
+    """A coal.CollisionGeometry, in the frame of the shape; of several boxes, their convex hull."""
     made: Any
     match shape:
         case Box():
@@ -31,7 +32,17 @@ def geometry(shape: Shape) -> Any:
             made = coal.makeOctree(shape.centres, shape.size)
         case Mesh():
             made = _mesh(shape)
+        case Boxes():
+            made = hull(shape.corners.reshape(-1, 3))
     return made
+
+
+def boxes(shape: Boxes) -> Iterator[tuple[Any, Vector]]:
+    """Each as a coal.Box, and its placement in the frame of the shape, shape (4, 4)."""
+    for size, (middle, *axes) in zip(shape.sizes.tolist(), shape.placements, strict=True):
+        placed = np.eye(4)
+        placed[:3, :3], placed[:3, 3] = np.transpose(axes), middle
+        yield coal.Box(*size), placed
 
 
 def convex(vertices: Vector, triangles: Triangles) -> Any:
@@ -42,6 +53,13 @@ def convex(vertices: Vector, triangles: Triangles) -> Any:
 def hull(points: Vector) -> Any:
     """The convex hull of points, shape (N, 3)."""
     return coal.Convex.convexHull(_points(points), False, None)
+
+
+def convex_faces(points: Vector) -> tuple[Vector, Triangles]:
+    """Corners of the convex hull of points, shape (N, 3), and its faces, as `Mesh` has them."""
+    body = coal.Convex.convexHull(_points(points), True, None)
+    faces = (body.polygons(number) for number in range(body.num_polygons))
+    return np.array(body.points()), np.array([[face[corner] for corner in range(3)] for face in faces], dtype=np.intp)
 
 
 def enclosing(shape: Any) -> Vector | None:

@@ -16,8 +16,8 @@ from ibrobot_kinematics.poses import matrix
 from ibrobot_core.api import PlanningError, Vector
 from ibrobot_core.app import PlanCode
 from ibrobot_planning.world.arm import ADJACENT, ALWAYS, NEVER, Arm, LinkShape, Pair, reach, sorted_pair
-from ibrobot_planning.world.coal_shapes import geometry
-from ibrobot_planning.world.objects import World
+from ibrobot_planning.world.coal_shapes import boxes, geometry
+from ibrobot_planning.world.objects import Boxes, World
 
 _FEW = 4
 """Lines of at most this many configurations are checked one by one."""
@@ -347,7 +347,8 @@ def object_shapes(arm: Arm, world: World) -> list[LinkShape]:
     shapes = []
     for name, thing in world.objects.items():
         joint, frame = (0, np.eye(4)) if thing.link is None else arm.frame(thing.link)
-        shapes.append(LinkShape(name, joint, frame @ matrix(thing.pose), geometry(thing.shape)))
+        several = boxes(thing.shape) if isinstance(thing.shape, Boxes) else [(geometry(thing.shape), np.eye(4))]
+        shapes += [LinkShape(name, joint, frame @ matrix(thing.pose) @ within, made) for made, within in several]
     return shapes
 
 

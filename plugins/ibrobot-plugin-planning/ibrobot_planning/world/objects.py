@@ -25,6 +25,8 @@ _LARGEST_M = 100.0
 _FLATTEST_M, _FLATTEST = 1e-9, 1e-6
 """Meshes flatter than this [m], or than this share of their largest coordinate, count as flat: Coal ends the process
 when it makes the convex hull of one whose thickness is lost in rounding, e.g. of a tilted plate in single precision."""
+_SQUARE = 1e-6
+"""Allowed error of products of axes."""
 
 
 def _positive(instance: object, attribute: attrs.Attribute[float], value: float) -> None:
@@ -158,7 +160,42 @@ class Voxels:
         return np.asarray((self.cells + 0.5) * self.size)
 
 
-type Shape = Box | Sphere | Cylinder | Capsule | Plane | Mesh | Voxels
+_CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+"""Of a box with lengths of 1, shape (8, 3)."""
+
+
+@attrs.frozen(eq=False)
+class Boxes:
+    """Boxes that together contain a body, e.g. a mesh of very many triangles.
+
+    Raises:
+        ValueError: for arrays of other shapes, none, numbers that are not finite, or implausible sizes.
+    """
+
+    sizes: Vector = attrs.field(converter=_array)
+    """Lengths along the axes of each [m], shape (N, 3)."""
+    placements: Vector = attrs.field(converter=_array)
+    """The middle of each [m], and the directions of its x, y and z axis, shape (N, 4, 3)."""
+
+    def __attrs_post_init__(self) -> None:
+        count = len(self.sizes)
+        if not count or self.sizes.shape != (count, 3) or self.placements.shape != (count, 4, 3):
+            raise ValueError(f"{self.sizes.shape} sizes and {self.placements.shape} placements, need (N, 3), (N, 4, 3)")
+        # Written so that NaN fails it.
+        if not ((self.sizes > 0) & (self.sizes <= _LARGEST_M)).all() or not np.isfinite(self.placements).all():
+            raise ValueError(f"boxes have lengths above 0, at most {_LARGEST_M:g} m, and finite places")
+        axes = self.placements[:, 1:]
+        if np.abs(axes @ axes.transpose(0, 2, 1) - np.eye(3)).max() > _SQUARE or (np.linalg.det(axes) < 0).any():
+            raise ValueError("the axes of boxes are directions at right angles, right-handed")
+
+    @property
+    def corners(self) -> Vector:
+        """Of each [m], shape (N, 8, 3)."""
+        within = _CORNERS * self.sizes[:, None]
+        return np.asarray(within @ self.placements[:, 1:] + self.placements[:, :1])
+
+
+type Shape = Box | Sphere | Cylinder | Capsule | Plane | Mesh | Voxels | Boxes
 SIMPLE: Mapping[Literal["box", "sphere", "cylinder", "capsule", "plane"], type[Any]] = {
     "box": Box, "sphere": Sphere, "cylinder": Cylinder, "capsule": Capsule, "plane": Plane,
 }  # fmt: skip
