@@ -46,10 +46,12 @@ PLACES = {"above": ((0.16, 0.04, 0.80), (0.16, 0.0401, 0.0)), "front": ((0.75, -
 REST = (0.0, -1.57, 1.57, 0.79, 0.0, 0.0)
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 TOP = "observation.images.top"
+ENDS = {"wrist_roll": (0, 4095), "gripper": (1500, 2760)}
 CALIBRATION = {
     "arm": {
-        joint: {"id": i, "drive_mode": 0, "homing_offset": 0, "range_min": 900, "range_max": 3100}
+        joint: {"id": i, "drive_mode": 0, "homing_offset": 0, "range_min": low, "range_max": high}
         for i, joint in enumerate(JOINTS, 1)
+        for low, high in [ENDS.get(joint, (900, 3200))]
     }
 }
 MOVED = {f"{pixels} px": math.atan(pixels / FOCAL) for pixels in (2, 5, 20, 40)} | {
@@ -190,7 +192,7 @@ def planted(table: str, place: str, number: int) -> Iterator[tuple[str, str, Liv
     whole = seen(usual)
     for kind, (picture, cause) in PICTURES.items():
         yield kind, cause, changed(whole, picture)
-    narrow = {"arm": {**CALIBRATION["arm"], "gripper": {**CALIBRATION["arm"]["gripper"], "range_max": 2600}}}
+    narrow = {"arm": {**CALIBRATION["arm"], "gripper": {**CALIBRATION["arm"]["gripper"], "range_max": 2400}}}
     yield "other gripper", "other_gripper", changed(whole, calibration=narrow)
     rests = by_chance(table, place, number, at_rest=True)
     still = seen(rests)

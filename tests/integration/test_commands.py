@@ -84,6 +84,8 @@ WRONG_FILES = {
     "feetech check BAD": (),
     "feetech check no_port --name ./BAD.json": (),
     "feetech check no_port --robot BAD": (),
+    "feetech compare BAD --leader-port no_port --yes": (),
+    "feetech compare no_port --leader-port BAD --robot BAD --yes": (),
     "feetech emulate --physics BAD": (),
     "feetech emulate --calibration ./BAD": ("missing",),
     "feetech import ./BAD --yes": (),

@@ -65,6 +65,14 @@ def ibrobot_guides() -> Iterable[GuideDescriptor]:
         make=Late("ibrobot_feetech.guides:check"),
         questions=Late("ibrobot_feetech.guides:check_questions"),
     )
+    yield GuideDescriptor(
+        "leader",
+        order=55,
+        label="Compare leader and follower",
+        summary="Set three poses by hand, and compare the zeros and directions of both arms.",
+        make=Late("ibrobot_feetech.guides:compare"),
+        questions=Late("ibrobot_feetech.guides:compare_questions"),
+    )
 
 
 @hookimpl
@@ -124,6 +132,7 @@ def ibrobot_commands() -> Iterable[Command]:
     yield Command("feetech calibrate", Late("ibrobot_feetech.commands.calibrate:Calibrate"))
     yield Command("feetech import", Late("ibrobot_feetech.commands.import_:ImportCalibration"))
     yield Command("feetech check", Late("ibrobot_feetech.commands.check:CheckArm"))
+    yield Command("feetech compare", Late("ibrobot_feetech.commands.compare:CompareArms"))
     yield Command("feetech monitor", Late("ibrobot_feetech.commands.monitor:Monitor"))
     yield Command("feetech torque", Late("ibrobot_feetech.commands.torque:Torque"))
     yield Command("feetech emulate", Late("ibrobot_feetech.commands.emulate:Emulate"))

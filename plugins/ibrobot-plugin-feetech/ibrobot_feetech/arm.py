@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 
 import attrs
 import numpy as np
 from ibrobot_calibration import Calibration, JointCalibration
+from ibrobot_calibration.plausibility import oddities
 from numpy.typing import NDArray
 
 from ibrobot_core.api import HardwareError, Vector
@@ -87,6 +88,12 @@ class Arm:
         """Lower and upper ends of the calibrated ranges [rad], each shape (J,)."""
         ends = [self.radians(limit) for limit in self._limits]
         return np.minimum(*ends), np.maximum(*ends)
+
+    def oddities(self, limits: Mapping[str, tuple[float, float]]) -> Iterator[str]:
+        """What is odd about the calibration; `limits` has those of the joints [rad] that ranges are compared with."""
+        for joint in self.joints:
+            numbers = {**attrs.asdict(self._of(joint)), "closed_at": self.closed.get(joint)}
+            yield from oddities(joint, numbers, limits.get(joint))
 
     def _of(self, joint: str) -> JointCalibration:
         return self.calibration.joints[joint]

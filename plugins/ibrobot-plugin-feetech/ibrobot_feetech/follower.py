@@ -129,7 +129,7 @@ class FeetechFollower(Hardware):
             bus.close()
             raise
         self._ctx.log.info("%s: %s", self._ctx.name, arm.zero_text)
-        self._warn_of_reach()
+        self._warn_of_ranges()
 
     @override
     def read(self) -> JointReading:
@@ -351,8 +351,11 @@ class FeetechFollower(Hardware):
         gentle = {"max_torque": 500, "protection_current": 250, "overload_torque": 25}
         return Tuning(every, dict.fromkeys(options.gentle, gentle))
 
-    def _warn_of_reach(self) -> None:
-        """Warn if a calibrated range ends before the YAML's limit, because the servo stops at the range."""
+    def _warn_of_ranges(self) -> None:
+        """Warn if the calibration is odd, or a range ends before the YAML's limit, where the servo stops."""
+        limits = dict(zip(self.joints, zip(*(each.tolist() for each in self._limits), strict=True), strict=True))
+        for odd in self._arm.oddities(limits):
+            self._ctx.log.warning("%s: %s", self._arm.calibration.path, odd)
         for joint, low, high, lower, upper in zip(self.joints, *self._arm.reach(), *self._limits, strict=True):
             if lower < low - 0.1 or upper > high + 0.1:
                 self._ctx.log.warning(

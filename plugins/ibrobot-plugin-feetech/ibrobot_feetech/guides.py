@@ -10,7 +10,9 @@ from ibrobot_core.api import HardwareError
 from ibrobot_feetech.calibration import ZERO_AT
 from ibrobot_feetech.commands.calibrate import calibrate_arm
 from ibrobot_feetech.commands.check import check_arm
+from ibrobot_feetech.commands.compare import compare_arms
 from ibrobot_feetech.commands.find_port import find_arm, list_ports
+from ibrobot_feetech.commands.find_stops import TORQUE
 from ibrobot_feetech.commands.joints import SO101
 from ibrobot_feetech.commands.setup_motors import set_up_motors
 from ibrobot_feetech.usb import usb_ports
@@ -54,14 +56,16 @@ def calibration_questions() -> Sequence[Question]:
         Question("leader", "It is a leader arm, which is moved by hand", False),
         Question("name", f"Name of the calibration; empty for {_FOLLOWER}, or {_LEADER} of a leader arm"),
         Question("zero_at", "Position of 0 rad", next(iter(ZERO_AT)), tuple(ZERO_AT)),
+        Question("auto", "The motors find the ends at low torque; never tried on real servos", False),
     )
 
 
 def calibrate(answers: Answered, guide: Guide) -> None:
     """Calibrate an arm."""
     calibrate_arm(
-        guide, _port(answers), _name(answers), leader=bool(answers["leader"]), zero_at=str(answers["zero_at"])
-    )
+        guide, _port(answers), _name(answers), leader=bool(answers["leader"]), zero_at=str(answers["zero_at"]),
+        torque=TORQUE if answers.get("auto") else None,
+    )  # fmt: skip
 
 
 def check_questions() -> Sequence[Question]:
@@ -70,13 +74,37 @@ def check_questions() -> Sequence[Question]:
         port_question(),
         Question("name", "Name of the calibration", _FOLLOWER, (_FOLLOWER, _LEADER), open=True),
         Question("write", "Write the file's values to servos that differ", False),
+        Question("signs", "Turn each joint by hand, to compare its direction", False),
     )
 
 
 def check(answers: Answered, guide: Guide) -> None:
     """Compare the servos with their calibration."""
-    if not check_arm(guide, _port(answers), _name(answers), write=bool(answers["write"])):
+    if not check_arm(
+        guide, _port(answers), _name(answers), write=bool(answers["write"]), signs=bool(answers.get("signs"))
+    ):
         raise HardwareError("the servos do not match the calibration")
+
+
+def compare_questions() -> Sequence[Question]:
+    """Ports and calibrations."""
+    arms = port_question().choices
+    return (
+        Question("port", "Port of the follower", "", arms, open=True),
+        Question("leader_port", "Port of the leader", "", arms, open=True),
+        Question("name", "Calibration of the follower", _FOLLOWER, (_FOLLOWER,), open=True),
+        Question("leader_name", "Calibration of the leader", _LEADER, (_LEADER,), open=True),
+    )
+
+
+def compare(answers: Answered, guide: Guide) -> None:
+    """Compare leader and follower."""
+    leader_port = str(answers["leader_port"]).strip()
+    if not leader_port:
+        raise HardwareError("give the port of the leader")
+    leader = _name({"name": answers["leader_name"], "leader": True})
+    if not compare_arms(guide, _port(answers), leader_port, _name(answers), leader):
+        raise HardwareError("leader and follower do not stand to each other as they should")
 
 
 def _port(answers: Answered) -> str | None:

@@ -117,6 +117,14 @@ class LeaderTeleop(Teleop):
             bus.close()
             raise TeleopError(f"{self._ctx.name}: {error}") from None
         self._ctx.log.info("%s: %s", self._ctx.name, self._arm.zero_text)
+        limits = zip(self._lower.tolist(), self._upper.tolist(), strict=True)
+        by_angle = {
+            joint: ends
+            for joint, ends, scaled in zip(self._leader_joints, limits, self._scaled.tolist(), strict=True)
+            if not scaled
+        }
+        for odd in self._arm.oddities(by_angle):
+            self._ctx.log.warning("%s: %s", self._arm.calibration.path, odd)
         self._bus, self._reader = bus, SyncReader(bus, self._arm.servos, "present_position")
         self._keys = self._ctx.keys() if self._ctx.keys is not None else None
 

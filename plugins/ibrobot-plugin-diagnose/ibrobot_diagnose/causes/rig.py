@@ -6,13 +6,14 @@ from collections.abc import Iterator, Mapping
 from typing import Any, override
 
 import numpy as np
+from ibrobot_calibration.plausibility import oddities
 
 from ibrobot_core.api import Contract, IbrobotError
 from ibrobot_diagnose.card import Card
 from ibrobot_diagnose.cause import CardCause, Cause, Evidence, Reference, likelihood
 from ibrobot_diagnose.causes.moved import Sight, sights
 from ibrobot_diagnose.rig import Rig, RigCamera
-from ibrobot_diagnose.window import Window
+from ibrobot_diagnose.window import Limits, Window
 
 _OF_RIG = frozenset({"rig", "rig card"})
 _DEGREES_PER_TICK = 360.0 / 4096
@@ -243,9 +244,9 @@ class OtherCalibration(RigCause):
 
 
 class CalibrationOdd(Cause):
-    """A calibration has numbers that no servo stores, or a range that passes the end of the encoder."""
+    """A calibration has numbers that no servo stores, a range past the encoder's end, or another joint's range."""
 
-    name, title = "calibration_odd", "the calibration has ranges and offsets that servos can have"
+    name, title = "calibration_odd", "the calibration has offsets that servos store, and the ranges of the joints"
     needs = frozenset({"rig"})
     explains = frozenset({"zero_shifted"})
     remedy = (
@@ -256,34 +257,23 @@ class CalibrationOdd(Cause):
     @override
     def test(self, window: Window, reference: Reference) -> Evidence | None:
         assert window.rig is not None
-        odd = [
-            f"{joint} {fault}"
+        limits = dict(zip(window.joints, window.limits, strict=True))
+        odd = tuple(
+            fault
             for joints in window.rig.calibration.values()
             for joint, numbers in joints.items()
-            for fault in _odd(numbers)
-        ]
+            for fault in oddities(joint, numbers, _ends(limits.get(joint)))
+        )
         if not window.rig.calibration:
             return None
-        number = float(len(odd))
-        text = f"The calibration is odd: {'; '.join(odd)}." if odd else "The calibration has usual numbers."
-        return Evidence(text, number, "joints", 1.0, 0.7 if odd else 0.0)
+        text = f"The calibration is odd: {odd[0]}." if odd else "The calibration has usual numbers."
+        return Evidence(text, float(len(odd)), "joints", 1.0, 0.7 if odd else 0.0, details=odd[1:])
 
 
-_LAST_TICK, _LARGEST_OFFSET, _NEAR = 4095, 2047, 8
-"""Of an encoder of 4096 ticks; the offset has a sign and 11 bits [ticks]."""
-_NARROW = 200
-"""Ranges below it are hardly those of a joint [ticks]."""
-
-
-def _odd(numbers: Mapping[str, Any]) -> Iterator[str]:
-    low, high, offset = (int(numbers[each]) for each in ("range_min", "range_max", "homing_offset"))
-    if abs(offset) > _LARGEST_OFFSET:
-        yield f"has an offset of {offset} ticks, where servos store {-_LARGEST_OFFSET} to {_LARGEST_OFFSET}"
-    turns_round = (low, high) == (0, _LAST_TICK)
-    if not turns_round and (low <= _NEAR or high >= _LAST_TICK - _NEAR):
-        yield f"has a range of {low} to {high} ticks, which ends where the encoder does: it passes the end there"
-    elif high - low < _NARROW:
-        yield f"has a range of {low} to {high} ticks only"
+def _ends(limits: Limits | None) -> tuple[float, float] | None:
+    if limits is None or not np.isfinite((limits.lower, limits.upper)).all():
+        return None
+    return limits.lower, limits.upper
 
 
 class OtherGripper(RigCause):

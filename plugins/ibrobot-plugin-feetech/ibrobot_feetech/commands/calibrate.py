@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -17,8 +18,9 @@ from ibrobot_feetech.arm import calibrated_registers, relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.calibration import ZERO_AT, save_calibration
 from ibrobot_feetech.commands.dialogue import TerminalGuide
-from ibrobot_feetech.commands.joints import by_servo, joints_of
-from ibrobot_feetech.commands.measure import Answers, Measurement
+from ibrobot_feetech.commands.find_stops import TORQUE, UNTRIED, StopFinder, missing_servos, offsets_of
+from ibrobot_feetech.commands.joints import Joint, by_servo, joints_of
+from ibrobot_feetech.commands.measure import Answers, Measurement, as_calibration
 from ibrobot_feetech.commands.ports import OnPort, opened
 from ibrobot_feetech.commands.zero import zero_text
 from ibrobot_feetech.usb import usb_port
@@ -34,6 +36,9 @@ class Calibrate(OnPort):
     Put it in its middle pose, then move each joint to both ends of its range.
 
     Nothing is written to the servos or to disk before everything is measured.
+
+    With --auto the motors find the ends at low torque, one joint after the other, and whatever ends it restores the
+    servos. This was tried on the emulator alone, never on real servos.
     """
 
     name: str | None = option(
@@ -55,6 +60,8 @@ class Calibrate(OnPort):
     middle_now: bool = option(False, help="the arm is in its middle pose: do not ask")
     range_seconds: float | None = option(None, ge=0.1, help="measure the ranges for this long, not until Enter")
     accept_ranges: bool = option(False, help="accept ranges that differ from the joints' limits")
+    auto: bool = option(False, help="find the ends by motor, at low torque; never tried on real servos")
+    torque: float = option(TORQUE, ge=0.05, le=0.5, help="with --auto, share of the full torque that no servo exceeds")
     yes: bool = option(False, help="switch torque off and overwrite without asking; the old file is kept")
 
     def __call__(self) -> None:
@@ -63,15 +70,18 @@ class Calibrate(OnPort):
             TerminalGuide(), self.port, name, leader=self.leader or name.endswith("leader"), robot=self.robot,
             arm=self.arm, full_turn=self.full_turn, zero_at=self.zero_at, prefix=self.prefix, yes=self.yes,
             answers=Answers(self.middle_now, self.range_seconds, self.accept_ranges, self.check_signs),
+            torque=self.torque if self.auto else None,
         )  # fmt: skip
 
 
 def calibrate_arm(
     guide: Guide, port: str | None, name: str, *, leader: bool = False, robot: str | None = None,
     arm: str | None = None, full_turn: Sequence[str] = FULL_TURN, zero_at: str = "pose", prefix: str = "",
-    yes: bool = False, answers: Answers | None = None,
+    yes: bool = False, answers: Answers | None = None, torque: float | None = None,
 ) -> None:  # fmt: skip
     """Calibrate an arm with an operator; the arguments are those of the command.
+
+    With `torque`, the motors find the ends of the ranges, with at most this share of their torque.
 
     Raises:
         CalibrationError: if the measured values are impossible.
@@ -87,15 +97,24 @@ def calibrate_arm(
         joint.name for joint in joints if joint.name in full_turn or joint.name.removeprefix(prefix) in full_turn
     ]
     with opened(port, joints=by_servo(joints)) as bus:
-        _prepare(bus, guide, yes)
-        try:
-            measurement = Measurement(
-                bus, guide, joints, full_turn=turning, compared=compared, zero_at=zero_at, answers=answers or Answers()
-            )
-            measured = measurement.run()
-        except BaseException:
-            guide.say("Nothing was written. The torque is off, and the servos' calibration is unchanged.", warning=True)
-            raise
+        if torque is not None:
+            measured = measure_by_motor(
+                bus, guide, joints, full_turn=turning, compared=compared, zero_at=zero_at, torque=torque, yes=yes,
+                answers=answers or Answers(),
+            )  # fmt: skip
+        else:
+            _prepare(bus, guide, yes)
+            try:
+                measurement = Measurement(
+                    bus, guide, joints, full_turn=turning, compared=compared, zero_at=zero_at,
+                    answers=answers or Answers(),
+                )  # fmt: skip
+                measured = measurement.run()
+            except BaseException:
+                guide.say(
+                    "Nothing was written. The torque is off, and the servos' calibration is unchanged.", warning=True
+                )
+                raise
         usb = usb_port(bus.port.path)
         adapter = usb.serial_number if usb is not None else ""
         date = datetime.now(UTC).isoformat(timespec="seconds")
@@ -107,6 +126,42 @@ def calibrate_arm(
         guide.say(zero_text(made))
         _write(bus, guide, measured, name)
     guide.say(f"written to servos {', '.join(str(joint.servo) for joint in joints)}")
+
+
+def measure_by_motor(
+    bus: FeetechBus, guide: Guide, joints: Sequence[Joint], *, full_turn: Sequence[str], compared: Sequence[str],
+    zero_at: str, torque: float, yes: bool, answers: Answers, clock: Callable[[], float] = time.monotonic,
+) -> dict[str, JointCalibration]:  # fmt: skip
+    """Measure an arm by its motors; the servos are as they were when it ends.
+
+    Raises:
+        CalibrationError: if what was found cannot be the joints' ranges.
+        Declined: if the operator does not go on, or stops the arm.
+        HardwareError: if a servo does not answer or obey, or is not well.
+    """
+    guide.say(UNTRIED, warning=True)
+    if not yes and not guide.confirm(
+        f"No servo will exceed {100 * torque:.0f} % of its torque. Find the stops?", flag="--yes"
+    ):
+        raise Declined
+    missing_servos(bus, joints)
+    finder = StopFinder(
+        bus, guide, joints, measured=[joint for joint in joints if joint.name not in full_turn], compared=compared,
+        torque=torque, asks=not yes, signs=answers.check_signs, clock=clock,
+    )  # fmt: skip
+    try:
+        with finder.restoring():
+            _prepare(bus, guide, yes)
+            if not answers.middle_now:
+                guide.wait("Put the arm into its middle pose, standing upright.", flag="--middle-now")
+            offsets = offsets_of(bus, joints)
+            finder.begin(offsets)
+            ranges, inverted = finder.run()
+    except BaseException:
+        restored = "" if finder.unrestored else " The servos have the registers and the torque that they had."
+        guide.say(f"Nothing was saved.{restored}", warning=True)
+        raise
+    return as_calibration(joints, offsets, ranges, inverted, zero_at)
 
 
 def backup(path: Path) -> Path | None:

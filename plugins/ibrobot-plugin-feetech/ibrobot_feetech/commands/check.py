@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import attrs
 from ibrobot_calibration import Calibration, load_calibration
+from ibrobot_calibration.plausibility import oddities
 from ibrobot_terminal import Guide
 
 from ibrobot_core.api import option
 from ibrobot_core.app import Declined, Unsuccessful
-from ibrobot_feetech.arm import calibrated_registers, write_eprom
+from ibrobot_feetech.arm import calibrated_registers, relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import TerminalGuide
-from ibrobot_feetech.commands.joints import joints_of
+from ibrobot_feetech.commands.joints import Joint, joints_of
+from ibrobot_feetech.commands.measure import turned_by_hand
 from ibrobot_feetech.commands.ports import OnPort, opened
 from ibrobot_feetech.commands.zero import zero_text
 from ibrobot_feetech.errors import NoReply
@@ -46,16 +48,21 @@ class CheckArm(OnPort):
     name: str = option("so101_follower", help="name of the calibration, or a path")
     robot: str | None = option(None, typed="--robot CONFIG", help="robot YAML with the joints; by default an SO-101")
     write: bool = option(False, help="write the file's values to servos that differ; switches their torque off")
+    check_signs: bool = option(False, help="ask to turn each joint in its positive direction, and compare")
     yes: bool = option(False, help="write without asking")
 
     def __call__(self) -> None:
-        if not check_arm(TerminalGuide(), self.port, self.name, robot=self.robot, write=self.write, yes=self.yes):
+        if not check_arm(
+            TerminalGuide(), self.port, self.name, robot=self.robot, write=self.write, signs=self.check_signs,
+            yes=self.yes,
+        ):  # fmt: skip
             raise Unsuccessful
 
 
 def check_arm(
-    guide: Guide, port: str | None, name: str, *, robot: str | None = None, write: bool = False, yes: bool = False
-) -> bool:
+    guide: Guide, port: str | None, name: str, *, robot: str | None = None, write: bool = False, signs: bool = False,
+    yes: bool = False,
+) -> bool:  # fmt: skip
     """Compare the servos with a calibration, and return whether they match; the arguments are those of the command.
 
     Raises:
@@ -63,11 +70,16 @@ def check_arm(
         Declined: if the operator does not let it write.
         HardwareError: if a servo answers wrongly, or the port is gone.
     """
-    calibration = load_calibration(name, [joint.name for joint in joints_of(robot, name)], tool=TOOL)
+    joints = joints_of(robot, name)
+    calibration = load_calibration(name, [joint.name for joint in joints], tool=TOOL)
     guide.say(
         f"{calibration.path}: arm {calibration.robot or 'unnamed'}, made {calibration.date or 'at an unknown time'}"
     )
     guide.say(zero_text(calibration))
+    for odd in odd_ranges(
+        calibration, joints, leader=calibration.path is not None and calibration.path.stem.endswith("leader")
+    ):
+        guide.say(f"warning: {odd}", warning=True)
     with opened(port, joints={joint.id: each for each, joint in calibration.joints.items()}) as bus:
         check_adapter(calibration, bus.port.path)
         differing = list(differences(bus, calibration))
@@ -80,12 +92,41 @@ def check_arm(
             for servo in servos:
                 write_eprom(bus, servo, {each.register: int(each.wanted) for each in wrong if each.servo == servo})
             differing = list(differences(bus, calibration))
+        reversed_ = list(_reversed(bus, guide, joints, calibration, yes=yes)) if signs else []
+    for text in reversed_:
+        guide.say(f"error: {text}", warning=True)
     if differing:
         _print(guide, differing)
-    if any(each.matters for each in differing):
+    if reversed_ or any(each.matters for each in differing):
         return False
     guide.say(f"{len(calibration.joints)} servos match the calibration")
     return True
+
+
+def odd_ranges(calibration: Calibration, joints: Sequence[Joint], *, leader: bool = False) -> Iterator[str]:
+    """What is odd about a calibration; the gripper of a leader is not compared, since its range is another one."""
+    for joint in joints:
+        numbers = attrs.asdict(calibration.joints[joint.name]) | {"closed_at": joint.lower if joint.anchored else None}
+        yield from oddities(joint.name, numbers, None if leader and joint.anchored else (joint.lower, joint.upper))
+
+
+def _reversed(
+    bus: FeetechBus, guide: Guide, joints: Sequence[Joint], calibration: Calibration, *, yes: bool
+) -> Iterator[str]:
+    """Ask to turn each joint, whose torque is switched off, and compare the direction with the file."""
+    guide.say("The torque will be switched off, and the arm will fall: hold it.")
+    if not (yes or guide.confirm("Go on?", flag="--yes", default=True)):
+        raise Declined
+    relax(bus, [calibration.joints[joint.name].id for joint in joints])
+    for joint in joints:
+        numbers = calibration.joints[joint.name]
+        turned = turned_by_hand(bus, guide, joint.name, numbers.id)
+        if (turned < 0) != numbers.inverted:
+            yield (
+                f"{joint.name}: it turned by {turned:+d} ticks in its positive direction, and drive_mode "
+                f"{numbers.drive_mode} in the file means {'fewer' if numbers.inverted else 'more'}: it is reversed; "
+                "`ibrobot feetech calibrate --check-signs` measures the directions again"
+            )
 
 
 def differences(bus: FeetechBus, calibration: Calibration) -> Iterator[Difference]:

@@ -54,8 +54,8 @@ class TerminalGuide(Guide):
         rows: Callable[[], Sequence[Sequence[str]]] | None = None, seconds: float | None = None,
     ) -> None:  # fmt: skip
         if seconds is None and not interactive():
-            done = f"{request} " if rows is None else ""
-            raise RequestError(f"{done}There is no terminal to press Enter in; run the command in one, or give {flag}")
+            done, instead = f"{request} " if rows is None else "", f", or give {flag}" if flag else ""
+            raise RequestError(f"{done}There is no terminal to press Enter in; run the command in one{instead}")
         if rows is None:
             prompt(f"{request} Then press Enter ", flag=flag)
             return

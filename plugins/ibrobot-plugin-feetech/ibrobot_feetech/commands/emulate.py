@@ -6,7 +6,7 @@ import datetime
 import math
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -68,6 +68,10 @@ class Emulate:
     blocked: tuple[int, ...] = option((), typed="--blocked ID", help="a servo whose joint does not move")
     overloaded: tuple[int, ...] = option((), typed="--overloaded ID", help="a servo under its maximum load")
     disconnected: tuple[int, ...] = option((), typed="--disconnected ID", help="a servo without its cable")
+    mechanics: bool = option(False, help="give the joints the stops, friction and weight of an SO-101's")
+    cables: tuple[tuple[int, int], ...] = option(
+        (), typed="--cable ID TICKS", help="with --mechanics, a cable that pulls a joint back from so many ticks on"
+    )
     errors: tuple[tuple[int, int], ...] = option((), typed="--error ID BITS", help="error bits of a servo")
 
     def __call__(self) -> None:
@@ -75,6 +79,12 @@ class Emulate:
 
         if self.link is not None and self.link.exists() and not self.link.is_symlink():
             raise RequestError(f"--link: {self.link} exists already and is not a link: choose another path")
+        if self.cables and not self.mechanics:
+            raise RequestError(
+                "--cable needs --mechanics: without it joints follow their goals, whatever is in the way"
+            )
+        if self.mechanics and self.physics is not None:
+            raise RequestError("--mechanics and --physics exclude each other: either moves the joints")
         ended = threading.Event()
         on_signals(ended.set)
         config = _config(self.physics) if self.physics is not None else None
@@ -94,6 +104,8 @@ class Emulate:
             faults.silent, faults.blocked = set(self.silent), set(self.blocked)
             faults.overloaded, faults.disconnected = set(self.overloaded), set(self.disconnected)
             faults.errors = dict(self.errors)
+            if self.mechanics:
+                _add_mechanics(emulator, joints, dict(self.cables))
             calibrated = _calibrate(emulator, self.calibration, joints, config.robot if config is not None else None)
             echo(str(self.link) if self.link is not None else emulator.port)
             arm = None
@@ -105,6 +117,18 @@ class Emulate:
             _hurry()
             echo(f"{count} servos at {self.baud} baud; Ctrl-C ends it", err=True)
             _wait(ended, arm)
+
+
+def _add_mechanics(emulator: Emulator, joints: Sequence[str], cables: Mapping[int, int]) -> None:
+    from ibrobot_feetech.emulator.mechanics import mechanics_of
+
+    for cable in cables:
+        if cable not in emulator.servos:
+            raise RequestError(f"--cable: there is no servo {cable}; ids are 1 to {len(emulator.servos)}")
+    for (servo, emulated), joint in zip(emulator.servos.items(), joints, strict=False):
+        lower, upper = next(ends for name, ends in SO101.items() if joint.endswith(name))
+        emulated.mechanics = mechanics_of(joint, lower, upper, MIDDLE_TICK)
+        emulated.mechanics.cable = cables.get(servo)
 
 
 def _hurry() -> None:

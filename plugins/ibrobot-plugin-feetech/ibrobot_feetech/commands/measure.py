@@ -66,20 +66,8 @@ class Measurement:
         """
         offsets = self._middle()
         ranges = self._ranges(offsets)
-        whole = Range(0, 0, TICKS_PER_TURN - 1)
         inverted = {joint.name: self._is_inverted(joint) for joint in self._joints} if self._answers.check_signs else {}
-        by_joint = {}
-        for joint in self._joints:
-            measured = ranges.get(joint.name, whole)
-            by_joint[joint.name] = JointCalibration(
-                id=joint.servo,
-                drive_mode=int(inverted.get(joint.name, False)),
-                homing_offset=offsets[joint.servo],
-                range_min=measured.least,
-                range_max=measured.greatest,
-                zero_at=self._zero_at,
-            )
-        return by_joint
+        return as_calibration(self._joints, offsets, ranges, inverted, self._zero_at)
 
     def _encoders(self) -> dict[int, int]:
         """Servo id -> its encoder's position [ticks], 0 to 4095."""
@@ -150,19 +138,46 @@ class Measurement:
 
     def _is_inverted(self, joint: Joint) -> bool:
         """Whether radians decrease as ticks increase."""
-        while True:
-            before = self._encoders()[joint.servo]
-            self._guide.wait(f"Turn {joint.name} a little in its positive direction.", flag="no --check-signs")
-            half = TICKS_PER_TURN // 2
-            moved = (self._encoders()[joint.servo] - before + half) % TICKS_PER_TURN - half
-            if abs(moved) >= _TURNED:
-                break
-            self._guide.say(f"error: {joint.name} moved by only {moved} ticks; try again", warning=True)
+        moved = turned_by_hand(self._bus, self._guide, joint.name, joint.servo)
         if moved < 0:
             self._guide.say(
                 f"warning: {joint.name}: ticks decrease as its angle increases: it is stored as inverted", warning=True
             )
         return moved < 0
+
+
+def turned_by_hand(bus: FeetechBus, guide: Guide, joint: str, servo: int) -> int:
+    """Ask to turn a joint in its positive direction until it has moved; returns by how much [ticks]."""
+    while True:
+        before = bus.read(servo, "present_position")
+        guide.wait(f"Turn {joint} a little in its positive direction.", flag="no --check-signs")
+        half = TICKS_PER_TURN // 2
+        moved = (bus.read(servo, "present_position") - before + half) % TICKS_PER_TURN - half
+        if abs(moved) >= _TURNED:
+            return moved
+        guide.say(
+            f"error: {joint} moved by {moved} ticks, and must move by {_TURNED} at least; try again", warning=True
+        )
+
+
+def as_calibration(
+    joints: Sequence[Joint], offsets: Mapping[int, int], ranges: Mapping[str, Range], inverted: Mapping[str, bool],
+    zero_at: str,
+) -> dict[str, JointCalibration]:  # fmt: skip
+    """What was measured, as a calibration; joints without a range can make a full turn."""
+    whole = Range(0, 0, TICKS_PER_TURN - 1)
+    by_joint = {}
+    for joint in joints:
+        measured = ranges.get(joint.name, whole)
+        by_joint[joint.name] = JointCalibration(
+            id=joint.servo,
+            drive_mode=int(inverted.get(joint.name, False)),
+            homing_offset=offsets[joint.servo],
+            range_min=measured.least,
+            range_max=measured.greatest,
+            zero_at=zero_at,
+        )
+    return by_joint
 
 
 def _rows(joints: Sequence[Joint], ranges: Mapping[str, Range]) -> list[tuple[str, ...]]:

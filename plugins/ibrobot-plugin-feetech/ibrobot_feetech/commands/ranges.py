@@ -8,17 +8,11 @@ from __future__ import annotations
 
 import attrs
 from ibrobot_calibration import JointCalibration
+from ibrobot_calibration.plausibility import LEAST_SPAN, misfits
 
 from ibrobot_core.api import CalibrationError
 from ibrobot_feetech.commands.joints import Joint
-from ibrobot_feetech.ticks import MIDDLE_TICK, TICKS_PER_RADIAN, TICKS_PER_TURN
-
-_LEAST_SPAN = 150
-"""A joint that moved by less counts as not moved [ticks]: 13 degrees."""
-_TOLERANCE = 0.25
-"""Allowed relative difference between a measured span and the span of the limits."""
-_OFF_CENTRE = 230
-"""Allowed distance between the middle of a range and the middle of the limits [ticks]: 20 degrees."""
+from ibrobot_feetech.ticks import MIDDLE_TICK, TICKS_PER_TURN
 
 
 def homing_offset(joint: str, encoder: int) -> int:
@@ -75,32 +69,16 @@ def impossible(joint: str, measured: Range) -> str | None:
             f"{joint}: its range {measured.least} to {measured.greatest} crosses the encoder's end (0/4095): "
             "the joint was not in the middle of its range in the middle pose; start again with it there"
         )
-    if measured.span < _LEAST_SPAN:
+    if measured.span < LEAST_SPAN:
         return f"{joint}: it moved by only {measured.span} ticks ({_deg(measured.span):.0f} deg): move it to both ends"
     return None
 
 
 def doubtful(joint: Joint, measured: Range, zero_at: str = "pose") -> str | None:
     """The reason why a range does not match the joint's limits; None if it does."""
-    expected = (joint.upper - joint.lower) * TICKS_PER_RADIAN
-    if abs(measured.span - expected) > _TOLERANCE * expected:
-        return (
-            f"{joint.name}: it moved by {_deg(measured.span):.0f} deg, its limits are {_deg(expected):.0f} deg apart; "
-            "check that it was moved to both ends, and that it is the right joint"
-        )
-    middle = abs((joint.lower + joint.upper) / 2) * TICKS_PER_RADIAN
-    if zero_at != "pose":
-        if joint.anchored or middle <= _OFF_CENTRE:
-            return None
-        return (
-            f"{joint.name}: the middle of its limits is {_deg(middle):.0f} deg off 0, so 0 deg is not the middle of "
-            "its range: use --zero-at pose"
-        )
-    # The sign of the ticks is unknown here, but limits around 0 have their middle near 0 either way.
-    off = abs((measured.least + measured.greatest) / 2 - MIDDLE_TICK) - middle
-    if not joint.anchored and off > _OFF_CENTRE:
-        return f"{joint.name}: the middle of its range is {_deg(off):.0f} deg from the middle pose, which is its 0 deg"
-    return None
+    limits = joint.lower, joint.upper
+    found = misfits(joint.name, measured.least, measured.greatest, limits, zero_at=zero_at, closed=joint.anchored)
+    return next(found, None)
 
 
 def _deg(ticks: float) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from ibrobot_feetech.emulator.mechanics import FREE_SPEED, Mechanics
 from ibrobot_feetech.registers import MODEL_STS3215, STS3215, Register, register
 
 TURN = 4096
@@ -15,10 +16,12 @@ _MIDDLE = 128
 """Writing it to `torque_enable` makes the present position the middle of the turn."""
 _WHEEL = 1
 """Operating mode in which the servo turns at its goal velocity."""
-_MAX_VELOCITY = 3073
-"""Maximum speed at 12 V without load [ticks/s]: 0.222 s for 60 degrees."""
 _DUTY_PER_TICK = 8.0
 """Duty cycle per tick between goal and joint, with a P coefficient of 32 [0.1 %]."""
+_PUSH_S = 0.005
+"""How often a servo with mechanics computes its duty cycle [s]."""
+_AMPERE = 0.0065
+"""Unit of `present_current` [A]."""
 _UNDERVOLTAGE, _OVERHEATING, _OVERLOAD = 0x01, 0x04, 0x20
 _MEASURED = ("present_voltage", "present_temperature")
 
@@ -81,6 +84,10 @@ class EmulatedServo:
         """Whether the joint is blocked."""
         self.burdened = False
         """Whether the motor is under maximum load, independent of the goal."""
+        self.mechanics: Mechanics | None = None
+        """The forces on the joint; None for a joint that follows its goal, whatever is in its way."""
+        self._profile = encoder
+        """Where the servo's own profile is on its way to the goal [encoder ticks], with mechanics."""
         self._driven = False
         self._heavy_s = 0.0
         self._overload = False
@@ -123,7 +130,7 @@ class EmulatedServo:
         """
         if self.torque:
             raise ValueError(f"servo {self.id} has torque on: it cannot be turned by hand")
-        self.encoder, self.velocity = encoder, 0.0
+        self.encoder, self.velocity, self._profile = encoder, 0.0, encoder
         self._publish()
 
     def drive(self, encoder: float, velocity: float) -> None:
@@ -165,13 +172,15 @@ class EmulatedServo:
         for name, value in measured.items():
             self.set(name, value)
         self.set("torque_limit", self.get("max_torque"))
-        self.velocity, self._prepared = 0.0, None
+        self.velocity, self._prepared, self._profile = 0.0, None, self.encoder
         self.advance(0.0)
         self.set("goal_position", self.get("present_position"))
 
     def advance(self, elapsed_s: float) -> None:
         """Advance by `elapsed_s` [s]: the joint moves towards its goal, and lasting high load causes an overload."""
-        if not self._driven:
+        if self.mechanics is not None and not self._driven:
+            self._pushed(self.mechanics, elapsed_s)
+        elif not self._driven:
             mode = self.get("operating_mode") if self.torque and not self.blocked else None
             if mode == 0:
                 self._follow(elapsed_s)
@@ -196,7 +205,7 @@ class EmulatedServo:
         if abs(way) < 0.5 and abs(self.velocity) < 50:
             self.encoder, self.velocity = self.encoder + way, 0.0
             return
-        top = float(min(abs(self.get("goal_velocity")) or _MAX_VELOCITY, _MAX_VELOCITY))
+        top = float(min(abs(self.get("goal_velocity")) or FREE_SPEED, FREE_SPEED))
         acceleration = 100.0 * (self.table[register("acceleration").address] or 254)
         remaining = elapsed_s
         step_s = 0.001
@@ -213,8 +222,26 @@ class EmulatedServo:
                 return
             self.encoder += moved
 
+    def _pushed(self, mechanics: Mechanics, elapsed_s: float) -> None:
+        """Move as the motor and the forces on the joint make it, in short steps."""
+        if not self.torque and mechanics.supported:
+            self.velocity, self._profile = 0.0, self.encoder
+            self.set("present_current", 0)
+            return
+        remaining = elapsed_s
+        while remaining > 1e-9:
+            step = min(_PUSH_S, remaining)
+            remaining -= step
+            top = float(abs(self.get("goal_velocity")) or FREE_SPEED)
+            ahead = self.goal - self._profile
+            self._profile = self._profile + max(-top * step, min(top * step, ahead)) if self.torque else self.encoder
+            duty = self._duty() / 1000
+            self.encoder, self.velocity = mechanics.advance(self.encoder, self.velocity, duty, step)
+        ampere = mechanics.current_a(self.velocity, self._duty() / 1000) if self.torque else 0.0
+        self.set("present_current", round(ampere / _AMPERE))
+
     def _way(self) -> float:
-        return self.goal - self.encoder
+        return (self.goal if self.mechanics is None else self._profile) - self.encoder
 
     def _protect(self, elapsed_s: float) -> None:
         """Go into overload according to the table. Only torque off ends it and, a moment later, the error bit."""

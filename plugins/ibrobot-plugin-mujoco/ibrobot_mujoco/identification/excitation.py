@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
+from itertools import batched
 from typing import Any
 
+import attrs
 import mujoco
 import numpy as np
 
@@ -34,6 +37,16 @@ _SECONDS_OF = {1.0: 0.6, 0.6: 0.9, 0.3: 1.6, 0.1: 4.0, 0.04: 9.0}
 """About how long a motion takes at a speed, with its pause [s]."""
 
 
+@attrs.frozen
+class _Unit:
+    """What is done in one go."""
+
+    seconds: float
+    """About how long it takes [s]."""
+    alternatives: tuple[dict[str, Any], ...]
+    """Steps, of which the first one that can be planned is done."""
+
+
 def excitation(config: RobotConfig, minutes: float, seed: int) -> dict[str, Any]:
     """The task, as the values of its YAML.
 
@@ -56,9 +69,9 @@ def excitation(config: RobotConfig, minutes: float, seed: int) -> dict[str, Any]
     arm = [joint for each in moved if each.goals == "trajectory" for joint in each.joints]
     grippers = [(each.name, each.joints[0]) for each in moved if each.goals == "position"]
     rng = np.random.default_rng(seed)
-    steps: list[dict[str, Any]] = [{"record": {"of": "task", "prompt": "excitation"}}]
-    steps += _limited(_steps(config.robot, arm, grippers, rng), 60 * minutes)
-    return {"name": "excitation", "mode": mode.name, "steps": steps}
+    steps = _joined(list(_limited(_units(config.robot, arm, grippers, rng), 60 * minutes)))
+    record = {"record": {"of": "task", "prompt": "excitation"}}
+    return {"name": "excitation", "mode": mode.name, "steps": [record, *steps]}
 
 
 def plainly(config: RobotConfig) -> list[str]:
@@ -79,13 +92,25 @@ def plainly(config: RobotConfig) -> list[str]:
     ]
 
 
-def _limited(steps: Iterator[tuple[float, dict[str, Any]]], seconds: float) -> Iterator[dict[str, Any]]:
+def _limited(units: Iterator[_Unit], seconds: float) -> Iterator[_Unit]:
     passed = 0.0
-    for number, (lasts, step) in enumerate(steps):
-        if passed >= seconds or number >= _MOST_STEPS:
+    for unit in units:
+        if passed >= seconds:
             return
-        passed += lasts
-        yield step
+        passed += unit.seconds
+        yield unit
+
+
+def _joined(units: Sequence[_Unit]) -> Iterator[dict[str, Any]]:
+    """The steps of a task, which has at most `_MOST_STEPS`: more units share a step."""
+    size = max(1, math.ceil(len(units) / _MOST_STEPS))
+    for group in batched(units, size):
+        count = max(len(each.alternatives) for each in group)
+        if count == size == 1:
+            yield group[0].alternatives[0]
+            continue
+        lists = [[each.alternatives[i % len(each.alternatives)] for each in group] for i in range(count)]
+        yield {"alternatives": [*lists, [{"wait": {"seconds": 0.1}}]]}
 
 
 def _height(robot: Robot) -> Callable[[Vector], float]:
@@ -149,26 +174,26 @@ class _Poses:
         return self._height(position) >= most
 
 
-def _steps(
+def _units(
     robot: Robot, arm: list[str], grippers: list[tuple[str, str]], rng: np.random.Generator
-) -> Iterator[tuple[float, dict[str, Any]]]:
-    """About how long each step lasts [s], and the step; without end."""
+) -> Iterator[_Unit]:  # fmt: skip
+    """The units of the motion, without end."""
     poses = _Poses(robot, arm, rng)
-    yield 1.5, _move(arm, poses.middle, 0.3)
+    yield _Unit(1.5, (_move(arm, poses.middle, 0.3),))
     while True:
         for speed in _SPEEDS:
             for _ in range(3 if speed == 1.0 else 1):
-                lists = [[_move(arm, poses.draw(), speed)] for _ in range(_ALTERNATIVES)]
-                yield _SECONDS_OF[speed], {"alternatives": [*lists, [{"wait": {"seconds": 0.1}}]]}
+                yield _Unit(_SECONDS_OF[speed], tuple(_move(arm, poses.draw(), speed) for _ in range(_ALTERNATIVES)))
             for name, joint in grippers if speed > 0.2 else ():
                 column = robot.joint_names.index(joint)
                 ends = robot.lower[column] + np.array([0.35, 0.8]) * (robot.upper[column] - robot.lower[column])
-                yield 0.5, {"gripper": {"position": round(float(rng.uniform(*ends)), 4), "executor": name}}
-        yield 1.0, {"wait": {"seconds": 1.0}}
+                position = round(float(rng.uniform(*ends)), 4)
+                yield _Unit(0.5, ({"gripper": {"position": position, "executor": name}},))
+        yield _Unit(1.0, ({"wait": {"seconds": 1.0}},))
         here = poses.draw(0.5)
-        yield 0.7, _move(arm, here, 0.5)
+        yield _Unit(0.7, (_move(arm, here, 0.5),))
         for sign in (1.0, -1.0, 1.0, 0.0):
-            yield 0.3, _move(arm, here + sign * _SMALL, 0.2)
+            yield _Unit(0.3, (_move(arm, here + sign * _SMALL, 0.2),))
 
 
 def _move(arm: list[str], position: Vector, speed: float) -> dict[str, Any]:
