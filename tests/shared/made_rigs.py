@@ -19,7 +19,7 @@ TOP, WRIST = "observation.images.top", "observation.images.wrist"
 HEIGHT, WIDTH = 240, 320
 CALIBRATION = {
     "arm": {
-        joint: {"id": number, "drive_mode": 0, "homing_offset": 0, "range_min": 800, "range_max": 3200}
+        joint: {"id": number, "drive_mode": 0, "homing_offset": 0, "range_min": 200, "range_max": 3900}
         for number, joint in enumerate(JOINTS, 1)
     }
 }

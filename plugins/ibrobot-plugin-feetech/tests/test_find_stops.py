@@ -206,7 +206,7 @@ def test_cable_that_yields_is_harmless(rig):
     rig.succeeds()
 
 
-def test_joint_that_is_mounted_the_other_way_is_told_by_its_weight(rig):
+def test_joint_that_is_mounted_the_other_way_is_known_by_its_weight(rig):
     rig.mechanics(3).gravity *= -1
     rig.refuses("elbow_flex: to hold it takes 1[0-9].* it is reversed, or the arm does not stand upright")
 
@@ -274,7 +274,7 @@ def test_servo_that_loses_power_for_a_moment_is_refused(rig):
 def test_servo_with_another_id_is_named(emulator):
     rig = Rig(emulator, (1, 2, 3, 4, 5, 6))
     rig.emulator.servos[3].set("id", 9)
-    rig.refuses("servo 3 .elbow_flex.: it does not answer; servo 9 does, which is no joint's", HardwareError)
+    rig.refuses("servo 3 .elbow_flex.: it does not answer; servo 9 does, and no joint has that id", HardwareError)
 
 
 def test_exchanged_servos_are_known_by_who_moves(rig):

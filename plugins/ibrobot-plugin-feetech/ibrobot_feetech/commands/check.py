@@ -125,7 +125,7 @@ def _reversed(
             yield (
                 f"{joint.name}: it turned by {turned:+d} ticks in its positive direction, and drive_mode "
                 f"{numbers.drive_mode} in the file means {'fewer' if numbers.inverted else 'more'}: it is reversed; "
-                "`ibrobot feetech calibrate --check-signs` measures the directions again"
+                "`ibrobot feetech calibrate` with --check-signs measures the directions again"
             )
 
 

@@ -116,7 +116,7 @@ def _verdict(joint: Joint, column: int, poses: Sequence[tuple[Vector, Vector]]) 
     if moved >= _MOVED_DEG and float(np.ptp(ours + theirs)) < 0.5 * float(np.ptp(apart)):
         text = (
             f"{joint.name}: as the follower turned by {moved:.0f} deg, the leader turned the other way: one of them is "
-            "reversed; `ibrobot feetech check --check-signs` says which, or name it in `inverted` of the leader"
+            "reversed; `ibrobot feetech check` with --check-signs says which, or name it in `inverted` of the leader"
         )
         return (*row, "FAIL"), text
     if float(np.ptp(apart)) > _FAILS_DEG:

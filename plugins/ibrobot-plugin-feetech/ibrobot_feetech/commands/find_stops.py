@@ -77,8 +77,7 @@ _NUDGE = 60
 _CLEAR_LOAD = 25
 """Mean load of both directions that surely is the weight [0.1 %]."""
 GRAVITY: Mapping[str, int] = {"shoulder_lift": 1, "elbow_flex": 1, "wrist_flex": 1}
-"""Joint of an SO-101 -> sign of the torque by which its weight pulls in the middle pose, with the arm standing "
-"upright."""
+"""Joint of an SO-101 -> sign of the torque of its weight in the middle pose, of an arm that stands upright."""
 _ORDER = ("gripper", "wrist_roll", "wrist_flex", "elbow_flex", "shoulder_lift", "shoulder_pan")
 """From the light end of the arm to its foot, so that heavy joints move last, with the others in the middle pose."""
 _STANCES: Mapping[str, Mapping[str, float]] = {
@@ -87,7 +86,7 @@ _STANCES: Mapping[str, Mapping[str, float]] = {
 }
 """Joint of an SO-101 -> where other joints stand meanwhile, from the middle pose [rad].
 
-In its simulation no link touches another one or the table then, but for the last 5 % of elbow_flex.
+In its simulation no link touches another one or the table then, except in the last 5 % of elbow_flex.
 """
 _STAND_OFF = 60
 """Least distance of these from a stop [ticks]."""
@@ -341,7 +340,7 @@ class StopFinder:
         if servo in self._held and servo != self._active and abs(state.position - self._held[servo]) > _OTHERS:
             raise HardwareError(
                 f"{place}: it moved from {self._held[servo]} to {state.position} ticks, by more than {_OTHERS}, while "
-                "it should stand still: somebody or something moves it, or its weight is more than the torque of "
+                "it should stand still: a person or a thing moves it, or its weight is more than the torque of "
                 f"{100 * self._torque:.0f} % holds; leave the arm alone, or give more by --torque"
             )
 
@@ -368,7 +367,7 @@ class StopFinder:
             self._guide.say(f"error: not restored: {text}", warning=True)
         if failed:
             self._guide.say(
-                "The torque of these servos may be on: cut the power. Afterwards `ibrobot feetech check --write` "
+                "The torque of these servos may be on: cut the power. Afterwards `ibrobot feetech check` with --write "
                 "writes their calibration again.",
                 warning=True,
             )
@@ -400,7 +399,7 @@ class StopFinder:
                     f"{joint.name}: it sagged by {_deg(self._held[joint.servo] - MIDDLE_TICK):.0f} deg as the "
                     "torque came "
                     f"on, more than {_deg(_OTHERS):.0f}: its weight is more than {100 * self._torque:.0f} % hold, or "
-                    "somebody holds it; fold the arm, or give more by --torque"
+                    "a person holds it; fold the arm, or give more by --torque"
                 )
 
     def _nudge(self, joint: Joint) -> _Steps[None]:
@@ -426,8 +425,8 @@ class StopFinder:
         servo = self._active = joint.servo
         low = yield from self._stop(joint, Way.DOWN)
         high = yield from self._stop(joint, Way.UP)
-        found = self._ranges[servo] = Range(low, low, high)
-        if joint.name in self._compared and (fault := misfit(joint, found, self._torque)):
+        between = self._ranges[servo] = Range(low, low, high)
+        if joint.name in self._compared and (fault := misfit(joint, between, self._torque)):
             raise CalibrationError(fault)
         for each in (joint, *stance):
             yield from self._moved(each, MIDDLE_TICK)
@@ -561,19 +560,19 @@ _LONGEST_S = 300.0
 """Longest time for the stops of one joint, where nobody is asked [s]."""
 
 
-def misfit(joint: Joint, found: Range, torque: float) -> str | None:
+def misfit(joint: Joint, between: Range, torque: float) -> str | None:
     """The reason why a range that was found is not that of the joint's limits; None if it can be."""
     expected = (joint.upper - joint.lower) * TICKS_PER_RADIAN
-    if found.span < (1 - _SHORT) * expected:
+    if between.span < (1 - _SHORT) * expected:
         return (
-            f"{joint.name}: between both places where it stops are {_deg(found.span):.0f} deg, its limits are "
+            f"{joint.name}: between both places where it stops are {_deg(between.span):.0f} deg, its limits are "
             f"{_deg(expected):.0f} deg apart, and at least {100 * (1 - _SHORT):.0f} % of that must be free: "
             "something is in "
             f"its way (a cable, the table, a hand), or {100 * torque:.0f} % of the torque are too little"
         )
-    if found.span > (1 + _LONG) * expected:
+    if between.span > (1 + _LONG) * expected:
         return (
-            f"{joint.name}: between its stops are {_deg(found.span):.0f} deg, its limits are {_deg(expected):.0f} "
+            f"{joint.name}: between its stops are {_deg(between.span):.0f} deg, its limits are {_deg(expected):.0f} "
             f"deg apart, more than {100 * (1 + _LONG):.0f} % of that: a stop is missing, or it is another joint"
         )
     return None
@@ -586,13 +585,13 @@ def missing_servos(bus: FeetechBus, joints: Sequence[Joint]) -> None:
         HardwareError: if one does not; with the ids that answer.
     """
     wanted = {joint.servo: joint.name for joint in joints}
-    found = bus.scan(one_by_one=False)
-    missing = [servo for servo in wanted if servo not in found]
-    strange = [servo for servo in found if servo not in wanted]
+    answering = bus.scan(one_by_one=False)
+    missing = [servo for servo in wanted if servo not in answering]
+    strange = [servo for servo in answering if servo not in wanted]
     if not missing:
         return
     servo, joint = missing[0], wanted[missing[0]]
-    has = f"; servo {strange[0]} does, which is no joint's" if strange else ""
+    has = f"; servo {strange[0]} does, and no joint has that id" if strange else ""
     raise HardwareError(
         f"{bus.place(servo)}: it does not answer{has}; check its cable, or give the servo of {joint} its id with "
         f"`ibrobot feetech setup-motors --joint {joint}`"

@@ -77,8 +77,8 @@ def impossible(joint: str, measured: Range) -> str | None:
 def doubtful(joint: Joint, measured: Range, zero_at: str = "pose") -> str | None:
     """The reason why a range does not match the joint's limits; None if it does."""
     limits = joint.lower, joint.upper
-    found = misfits(joint.name, measured.least, measured.greatest, limits, zero_at=zero_at, closed=joint.anchored)
-    return next(found, None)
+    doubts = misfits(joint.name, measured.least, measured.greatest, limits, zero_at=zero_at, closed=joint.anchored)
+    return next(doubts, None)
 
 
 def _deg(ticks: float) -> float:

@@ -22,7 +22,7 @@ _STILL = 2.0
 
 
 _BEYOND = 0.02
-"""Share of a joint's range by which its stops are beyond its limits, on each side."""
+"""Distance from a joint's limit to its stop [of its range]."""
 _WEIGHTS = {"shoulder_lift": 0.19, "elbow_flex": 0.16, "wrist_flex": 0.04}
 """Torques of an SO-101's weight in the middle pose, by its MJCF [of 2.94 Nm, the stall torque at 12 V]."""
 
@@ -52,7 +52,7 @@ class Mechanics:
     hand: float | None = None
     """Where a hand holds the joint; None: nowhere."""
     supported: bool = True
-    """Whether somebody holds the arm while its torque is off; otherwise it falls."""
+    """Whether a person holds the arm while its torque is off; otherwise it falls."""
 
     def advance(self, encoder: float, velocity: float, duty: float, elapsed_s: float) -> tuple[float, float]:
         """Position [ticks] and speed [ticks/s] after a time with the motor's duty cycle, -1 to 1."""
