@@ -165,8 +165,10 @@ def test_what_else_is_wrong_is_found(changes, cause, verdict):
 @pytest.mark.parametrize(
     ("numbers", "says"),
     [
-        ({"homing_offset": -2100}, "its offset is -2100 ticks, and a servo stores -2047 to 2047"), ({"range_min": 3}, "ends within 8 ticks of the encoder's end"),
-        ({"range_max": 4095}, "ends within 8 ticks of the encoder's end"), ({"range_min": 3800}, "its range is 100 ticks (9 deg)"),
+        ({"homing_offset": -2100}, "its offset is -2100 ticks, and a servo stores -2047 to 2047"),
+        ({"range_min": 3}, "ends within 8 ticks of the encoder's end"),
+        ({"range_max": 4095}, "ends within 8 ticks of the encoder's end"),
+        ({"range_min": 3800}, "its range is 100 ticks (9 deg)"),
         ({"range_max": 2600}, "it moved by 211 deg, its limits are 344 deg apart"),
         ({"range_min": 900}, "the middle of its range is 31 deg from the middle pose"),
         ({"range_min": 0, "range_max": 4095}, None),
