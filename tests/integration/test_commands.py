@@ -114,6 +114,8 @@ WRONG_FILES = {
     "ui BAD --no-browser --port 0": ("folder",),
     "camera board -o BAD": (),
     "camera calibrate BAD": (),
+    "camera mount BAD EPISODE --camera top": (),
+    "camera mount so101_blind BAD --camera top": (),
     "explain BAD": (),
     "preflight BAD": (),
     "identify BAD": (),

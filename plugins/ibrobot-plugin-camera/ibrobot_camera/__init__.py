@@ -49,6 +49,7 @@ def ibrobot_commands() -> Iterable[Command]:
     yield Command("camera snapshot", Late("ibrobot_camera.commands.snapshot:Snapshot"))
     yield Command("camera board", Late("ibrobot_camera.commands.calibrate:MakeBoard"))
     yield Command("camera calibrate", Late("ibrobot_camera.commands.calibrate:CalibrateCamera"))
+    yield Command("camera mount", Late("ibrobot_camera.commands.mount:MountCamera"))
 
 
 @hookimpl(optionalhook=True)

@@ -12,6 +12,7 @@ from typing import Any
 import attrs
 from ibrobot_provenance.reports import ReportDescriptor
 from ibrobot_provenance.work import Work, Workplace, some_options
+from ibrobot_terminal import GuideDescriptor
 
 from ibrobot_core.api import Descriptor, Late, hookimpl
 from ibrobot_core.app import Command, Kind, SectionDescriptor
@@ -57,6 +58,19 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
         make=Late("ibrobot_diagnose.section:RigCheck"),
         without_section=Late("ibrobot_diagnose.section:compares"),
         summary="compares the rig with a reference before a run moves it",
+    )
+
+
+@hookimpl(optionalhook=True)
+def ibrobot_guides() -> Iterable[GuideDescriptor]:
+    """A camera that has moved, with the pictures of then and now."""
+    yield GuideDescriptor(
+        "refit",
+        order=80,
+        label="Put a camera back",
+        summary="Show what a camera sees over what it saw in a reference of `ibrobot preflight`, until it fits again.",
+        make=Late("ibrobot_diagnose.refit:refit"),
+        questions=Late("ibrobot_diagnose.refit:questions"),
     )
 
 

@@ -187,6 +187,8 @@ class Moved:
     """Number of these that are where they were."""
     found: int
     """Number of these that are where the alignment says."""
+    way: tuple[float, float] = (0.0, 0.0)
+    """By how much the middle of the picture has moved to the right and down, for a picture of 640 pixels' width."""
 
     @property
     def unclear(self) -> str:
@@ -243,7 +245,8 @@ def moved_of(reference: Grey, picture: Grey, weight: Grey, shown: Grey) -> Moved
     x, y = _centres(reference.shape, np.ones_like(rich) if spread else alike if matches else rich)
     moved_x, moved_y = p[0] + p[2] * x - p[3] * y, p[1] + p[3] * x + p[2] * y
     pixels = float(np.median(np.hypot(moved_x, moved_y))) * 640 / reference.shape[1] if len(x) else 0.0
-    return Moved(pixels, float(np.arctan2(p[3], 1 + p[2])), int(rich.sum()), in_place, matches)
+    way = float(p[0]) * 640 / reference.shape[1], float(p[1]) * 640 / reference.shape[1]
+    return Moved(pixels, float(np.arctan2(p[3], 1 + p[2])), int(rich.sum()), in_place, matches, way)
 
 
 def _quality(

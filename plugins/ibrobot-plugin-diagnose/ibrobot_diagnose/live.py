@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import override
 
 import attrs
@@ -49,23 +50,32 @@ def look(
     Raises:
         IbrobotError: if a part of the robot does not start, or dies.
     """
+    with looking(config, lockstep=lockstep, seed=seed, tell=tell) as (runtime, watch):
+        watch.begin()
+        _run(runtime, watch, seconds)
+        seen = watch.window()
+        seen = attrs.evolve(seen, window=attrs.evolve(seen.window, rig=_with_leaders(seen.rig, runtime.session)))
+    runtime.raise_failure()
+    return seen
+
+
+@contextmanager
+def looking(
+    config: RobotConfig, *, lockstep: bool = False, seed: int = 0, tell: Callable[[str], None] = lambda what: None
+) -> Iterator[tuple[Runtime, Watch]]:
+    """A run in which nothing moves, after automatic exposures have settled, and what it shows; as `look`."""
     runtime = Runtime(Session(still(config), installed_plugins(), LaunchRequest(lockstep, seed, source=_Still)))
     watch = Watch(runtime.session)
     try:
         runtime.start(tell)
         tell("the window")
         _run(runtime, watch, SETTLE_S)
-        watch.begin()
-        _run(runtime, watch, seconds)
-        seen = watch.window()
-        seen = attrs.evolve(seen, window=attrs.evolve(seen.window, rig=_with_leaders(seen.rig, runtime.session)))
+        yield runtime, watch
     finally:
         watch.close()
         runtime.stop()
         for line in runtime.session.outcome.holding:
             echo(line, err=True)
-    runtime.raise_failure()
-    return seen
 
 
 class _Still(SourceWorker):

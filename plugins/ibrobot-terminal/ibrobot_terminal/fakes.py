@@ -42,11 +42,13 @@ class FakeGuide(Guide):
     Attributes:
         said: texts, titles of pictures and requests, in their order.
         tables: the rows of the tables that were shown.
+        sights: the pictures that were shown while the operator worked.
     """
 
     def __init__(self) -> None:
         self.said: list[str] = []
         self.tables: list[Cells] = []
+        self.sights: list[bytes] = []
 
     @override
     def say(self, text: str, *, warning: bool = False) -> None:
@@ -64,8 +66,11 @@ class FakeGuide(Guide):
     @override
     def wait(
         self, request: str, *, flag: str = "", columns: Sequence[str] = (),
-        rows: Callable[[], Cells] | None = None, seconds: float | None = None,
+        rows: Callable[[], Cells] | None = None, sight: Callable[[], bytes | None] | None = None,
+        seconds: float | None = None,
     ) -> None:  # fmt: skip
         self.said.append(request)
         if rows is not None:
             self.tables.append(rows())
+        if sight is not None and (shown := sight()) is not None:
+            self.sights.append(shown)

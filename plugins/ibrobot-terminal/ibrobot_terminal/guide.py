@@ -57,7 +57,8 @@ class Guide(ABC):
     @abstractmethod
     def wait(
         self, request: str, *, flag: str = "", columns: Sequence[str] = (),
-        rows: Callable[[], Cells] | None = None, seconds: float | None = None,
+        rows: Callable[[], Cells] | None = None, sight: Callable[[], bytes | None] | None = None,
+        seconds: float | None = None,
     ) -> None:  # fmt: skip
         """Ask the operator to do something, and wait until they say that it is done.
 
@@ -66,6 +67,8 @@ class Guide(ABC):
             flag: the option that does without, where nobody can be asked.
             columns: heads of a table that is shown meanwhile.
             rows: returns its present rows; called at least 20 times a second.
+            sight: returns a JPEG that is shown meanwhile, in place of the last one, or None if there is no newer one;
+                called a few times per second, where pictures can be shown.
             seconds: time after which it counts as done [s]; None: the operator says so.
         """
 

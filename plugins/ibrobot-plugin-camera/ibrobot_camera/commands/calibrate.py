@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -157,7 +157,7 @@ def guided(answers: Mapping[str, str | bool], guide: Guide) -> None:
         board = Board(square=float(answers["square"]))
     except ValueError as error:
         raise SensorError(f"side of a square: {error}") from None
-    views, picture, last = Views(), np.zeros((1, 1), np.uint8), [""]
+    views, picture = Views(), np.zeros((1, 1), np.uint8)
     with camera(str(answers["camera"])) as (name, read):
 
         def rows() -> list[list[str]]:
@@ -165,18 +165,25 @@ def guided(answers: Mapping[str, str | bool], guide: Guide) -> None:
             if (taken := read(0.02)) is not None:
                 picture = taken
                 views.add_live(find(taken, board, f"view {len(views.views) + 1}"))
-            last[0] = views.missing(VIEWS) or "enough: go on"
-            return [[str(len(views.views)), last[0]]]
+            return [[str(len(views.views)), views.missing(VIEWS) or "enough: go on"]]
 
-        guide.wait("Show the board as the table says, still for a moment each.", columns=(">views", "next"), rows=rows)
-    for view in views.views:
-        for x, y in view.corners.tolist():
-            cv2.circle(picture, (round(x), round(y)), 2, (0, 0, 255), -1)
-    encoded, jpeg = cv2.imencode(".jpg", picture)
-    if encoded and views.views:
-        guide.picture("corners of all views", jpeg.tobytes())
+        guide.wait(
+            "Show the board as the table says, still for a moment each.",
+            columns=(">views", "next"), rows=rows, sight=lambda: _with_corners(picture, views.views),
+        )  # fmt: skip
+    if views.views:
+        guide.picture("corners of all views", _with_corners(picture, views.views))
     result, path = solve(views.views), Path(str(answers["file"]))
     result.save(path, name)
     for line in result.lines():
         guide.say(line)
     guide.say(f"{path} is written; put it into the robot YAML: info: {path}")
+
+
+def _with_corners(picture: NDArray[np.uint8], views: Sequence[View]) -> bytes:
+    """A picture, grey or BGR, with the corners of all views, as JPEG."""
+    shown = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) if picture.ndim == 2 else picture.copy()
+    for view in views:
+        for x, y in view.corners.tolist():
+            cv2.circle(shown, (round(x), round(y)), 2, (0, 0, 255), -1)
+    return bytes(cv2.imencode(".jpg", shown)[1].tobytes())

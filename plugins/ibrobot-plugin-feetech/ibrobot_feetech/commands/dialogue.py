@@ -51,7 +51,8 @@ class TerminalGuide(Guide):
     @override
     def wait(
         self, request: str, *, flag: str = "", columns: Sequence[str] = (),
-        rows: Callable[[], Sequence[Sequence[str]]] | None = None, seconds: float | None = None,
+        rows: Callable[[], Sequence[Sequence[str]]] | None = None, sight: Callable[[], bytes | None] | None = None,
+        seconds: float | None = None,
     ) -> None:  # fmt: skip
         if seconds is None and not interactive():
             done, instead = f"{request} " if rows is None else "", f", or give {flag}" if flag else ""

@@ -40,6 +40,8 @@ class Work:
     items: list[dict[str, Any]] = attrs.field(factory=list)
     """What was shown: texts, tables and pictures."""
     pictures: list[bytes] = attrs.field(factory=list, repr=False)
+    sight: bytes = attrs.field(default=b"", repr=False)
+    """What is shown while the operator works."""
     ask: dict[str, Any] | None = None
     """What the operator is asked at present."""
     state: str = "running"
@@ -107,6 +109,9 @@ def _take(work: Work, message: ChannelMessage) -> None:
             work.ask = {name: message[name] for name in ("ask", "kind", "text")}
         case "rows" if work.ask is not None and work.ask["ask"] == message["ask"]:
             work.ask |= _table(message)
+        case "sight" if work.ask is not None and work.ask["ask"] == message["ask"]:
+            work.sight = bytes(message.payload)
+            work.ask["sight"] = work.ask.get("sight", 0) + 1
 
 
 def _table(message: Mapping[str, Any]) -> dict[str, Any]:
@@ -183,6 +188,15 @@ def picture(ui: Ui, picture: int = option(ge=0), n: int = 0) -> Picture:
     return Picture(content, "image/png" if content.startswith(b"\x89PNG") else "image/jpeg")
 
 
+def sight(ui: Ui, sight: int = option(ge=0), n: int = 0) -> Picture:
+    """What the guide shows while the operator works; the numbers keep browsers from showing an earlier one."""
+    devices = ui.keep(Devices)
+    with devices.lock:
+        if devices.work is None or not devices.work.sight:
+            raise IbrobotError("no such picture")
+        return Picture(devices.work.sight, "image/jpeg")
+
+
 def answer(ui: Ui, number: int, ask: int, ok: bool = True) -> None:
     """Answer what the guide asks: yes or no; yes for what is done."""
     devices = ui.keep(Devices)
@@ -207,6 +221,7 @@ ROUTES: Routes = {
     "GET /list": listing,
     "GET /state": state,
     "GET /picture": picture,
+    "GET /sight": sight,
     "POST /start": start,
     "POST /answer": answer,
     "POST /cancel": cancel,

@@ -1,8 +1,8 @@
 """The process of a guide: `python -m ibrobot_web.ui.guide_process CHANNEL`, started by the view devices.
 
 Its order has the guide's `name` and the `answers` to its questions. It sends the server `say`, `show`, `picture`,
-and requests `{"ask": N, "kind": "confirm" | "wait", "text": …}` with `rows` while one waits; the server replies
-`{"reply": N, "ok": …}`. It ends with `done` or a `Failure`, or when the server closes the channel.
+and requests `{"ask": N, "kind": "confirm" | "wait", "text": …}` with `rows` and `sight` while one waits; the server
+replies `{"reply": N, "ok": …}`. It ends with `done` or a `Failure`, or when the server closes the channel.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import Channel, run_child
 
 _POLL_S = 0.03
-_ROWS_S = 0.1
-"""Shortest time between two tables that are sent while the operator works [s]."""
+_ROWS_S, _SIGHT_S = 0.1, 0.2
+"""Shortest times between two tables and two pictures that are sent while the operator works [s]."""
 
 
 class Left(IbrobotError):
@@ -59,19 +59,22 @@ class PageGuide(Guide):
     @override
     def wait(
         self, request: str, *, flag: str = "", columns: Sequence[str] = (),
-        rows: Callable[[], Sequence[Sequence[str]]] | None = None, seconds: float | None = None,
+        rows: Callable[[], Sequence[Sequence[str]]] | None = None, sight: Callable[[], bytes | None] | None = None,
+        seconds: float | None = None,
     ) -> None:  # fmt: skip
         until_s = time.monotonic() + seconds if seconds is not None else None
-        next_s = 0.0
+        next_s = sight_s = 0.0
 
         def meanwhile(number: int) -> None:
-            nonlocal next_s
-            if rows is None:
-                return
-            rows_now, now_s = rows(), time.monotonic()
-            if now_s >= next_s:
+            nonlocal next_s, sight_s
+            rows_now, now_s = rows() if rows is not None else None, time.monotonic()
+            if rows_now is not None and now_s >= next_s:
                 next_s = now_s + _ROWS_S
                 self._channel.send({"event": "rows", "ask": number, "columns": columns, "rows": rows_now})
+            if sight is not None and now_s >= sight_s:
+                sight_s = now_s + _SIGHT_S
+                if (shown := sight()) is not None:
+                    self._channel.send({"event": "sight", "ask": number}, shown)
 
         self._ask("wait", request, meanwhile, until_s)
 

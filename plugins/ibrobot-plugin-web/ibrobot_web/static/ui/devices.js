@@ -95,6 +95,10 @@ export class View {
     this.cancel.disabled = !this.ui.drives;
     refresh(this.ask, ask ? [ask.ask, ask.text] : null, () => (ask ? this.question(ask) : []));
     if (ask?.rows) refresh(this.live, ask.rows, () => tableOf(ask));
+    if (ask?.sight && this.sight.complete) {
+      this.sight.hidden = false;
+      this.sight.src = this.ui.address("devices/sight", { sight: ask.sight, n: this.number });
+    }
   }
 
   question({ ask, kind, text }) {
@@ -103,7 +107,8 @@ export class View {
       onclick: async () => { await this.post("answer", { ask, ok }); this.poll(); },
     }, label);
     this.live = h("div", { class: "scroll" });
-    return [h("p", { class: "request", role: "alert" }, text), this.live,
+    this.sight = h("img", { class: "sight", alt: "What the camera sees", hidden: true });
+    return [h("p", { class: "request", role: "alert" }, text), this.live, this.sight,
       h("div", { class: "row" }, ...(kind === "confirm" ? [button("Yes", true, true), button("No", false)] : [button("Done", true, true)]))];
   }
 
