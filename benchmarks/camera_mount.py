@@ -26,10 +26,10 @@ import numpy as np
 from figures import report
 from ibrobot_camera.intrinsics.board import Board
 from ibrobot_camera.intrinsics.views import View, find
-from ibrobot_camera.mounting.chain import Chain
 from ibrobot_camera.mounting.fit import Session
 from ibrobot_camera.mounting.shots import Lens, Shot, shot_of
 from ibrobot_camera.mounting.solve import solve_mount
+from ibrobot_kinematics.link_chain import Chain
 from ibrobot_kinematics.mjcf import read_mjcf
 from ibrobot_kinematics.poses import homogeneous
 from ibrobot_kinematics.rotations import exp, log, quaternion

@@ -32,6 +32,8 @@ _CAMERA, _FEETECH, _LEROBOT, _MCAP, _WEB = (
 )
 REMEDIES = {
     "ibrobot camera list": f"{_CAMERA}/test_commands.py::test_list_shows_stable_ids_and_modes",
+    "ibrobot camera calibrate": f"{_CAMERA}/test_calibrate.py::test_a_folder_of_pictures_gives_a_file",
+    "ibrobot config copy": f"{_WEB}/test_config_copy.py::test_the_copy_has_the_same_text_except_for_the_values_given",
     "ibrobot config new": "plugins/ibrobot-plugin-mujoco/tests/test_urdf.py::"
     "test_arm_of_any_number_of_joints_starts_in_each_mode",
     "ibrobot contract init": "tests/integration/test_contract_alone.py::"

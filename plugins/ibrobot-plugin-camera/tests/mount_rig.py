@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from ibrobot_camera.intrinsics.board import Board
 from ibrobot_camera.intrinsics.views import View
-from ibrobot_camera.mounting.chain import Chain
 from ibrobot_camera.mounting.fit import Session
 from ibrobot_camera.mounting.shots import Lens, Shot, shot_of
+from ibrobot_kinematics.link_chain import Chain
 from ibrobot_kinematics.poses import homogeneous
 from ibrobot_kinematics.rotations import exp, from_rpy
 from ibrobot_kinematics.urdf import read_urdf

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ibrobot_camera.mounting.chain import Chain
 from ibrobot_camera.mounting.closed import SOLVERS, solved
 from ibrobot_camera.mounting.edit import with_transform
 from ibrobot_camera.mounting.fit import Session
 from ibrobot_camera.mounting.shots import shot_of
 from ibrobot_camera.mounting.solve import solve_mount
 from ibrobot_kinematics.frames import transform
+from ibrobot_kinematics.link_chain import Chain
 from ibrobot_kinematics.poses import homogeneous, matrix
 from ibrobot_kinematics.rotations import exp
 from ibrobot_kinematics.urdf import read_urdf
@@ -109,7 +109,7 @@ def test_each_solver_closes_the_loop(name: str, camera: Any, board: Any, seed: i
 
 
 @pytest.mark.skipif(not hasattr(cv2, "calibrateHandEye"), reason="this OpenCV has no bindings of its solvers")
-def test_solvers_agree_with_those_of_opencv(tmp_path: Path) -> None:
+def test_solvers_agree_with_opencv(tmp_path: Path) -> None:
     session = made(tmp_path, noise=0.3).session
     inverse = np.linalg.inv(session.arm)
     solve: Any = cv2.calibrateHandEye  # type: ignore[attr-defined, unused-ignore]

@@ -44,7 +44,7 @@ def questions() -> Sequence[Question]:
 
 
 def refit(answers: Mapping[str, str | bool], guide: Guide) -> None:
-    """Show a camera's picture over that of a reference until the operator has put it back. Nothing moves.
+    """Show a camera's picture over that of a reference until an operator has put it back. Nothing moves.
 
     Raises:
         IbrobotError: if the robot or the reference cannot be read, or the camera is not in both.
@@ -147,7 +147,7 @@ class Refit:
 
 
 def _turns(sight: Sight) -> str:
-    """How to turn a camera, as somebody who stands behind it sees it."""
+    """How to turn a camera, as seen from behind it."""
     assert sight.moved is not None
     if sight.moved.is_other_view:
         return "it shows another view"

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import mujoco
 import numpy as np
 from ibrobot_kinematics.errors import KinematicsError
-from ibrobot_kinematics.mjcf import read_mjcf, several_arms
+from ibrobot_kinematics.link_chain import Chain
+from ibrobot_kinematics.mjcf import Mjcf, read_mjcf, several_arms
+from ibrobot_kinematics.poses import homogeneous
 from ibrobot_kinematics.rotations import from_quaternion, from_rpy, quaternion
+from ibrobot_kinematics.urdf import read_urdf
 from numpy.typing import NDArray
 
 from ibrobot_core.api import CameraInfo, NotSupported, Vector
@@ -98,18 +102,49 @@ def _mounted(config: RobotConfig, camera: str, info: CameraInfo | None) -> tuple
         spec = several_arms(path, arms) if (arms := config.robot.description.arms) else read_mjcf(path).spec.copy()
     except KinematicsError as error:
         raise NotSupported(str(error)) from None
-    body = spec.body(mount.parent) or (spec.worldbody if mount.parent in ("world", _base(spec)) else None)
-    if body is None:
-        bodies = ", ".join(each.name for each in spec.bodies)
-        raise NotSupported(f"camera {camera}: its parent {mount.parent} is no body of the MJCF; these are: {bodies}")
-    turn = _rotation(mount) @ _SEEN
+    try:
+        body, link = _carried(spec, path, config, mount.parent)
+    except KinematicsError as error:
+        raise NotSupported(f"camera {camera}: {error}") from None
+    placed = link @ homogeneous(_rotation(mount) @ _SEEN, np.array(mount.xyz))
     fovy = math.degrees(2 * math.atan(info.height / 2 / float(info.k[4])))
-    body.add_camera(name=_CAMERA, pos=mount.xyz, quat=np.roll(quaternion(turn), 1), fovy=fovy)
+    body.add_camera(name=_CAMERA, pos=placed[:3, 3], quat=np.roll(quaternion(placed[:3, :3]), 1), fovy=fovy)
     try:
         model = spec.compile()
     except ValueError as error:
         raise NotSupported(f"{path} does not compile: {error}") from None
     return model, int(model.camera(_CAMERA).id)
+
+
+def _carried(
+    spec: mujoco.MjSpec, path: Path, config: RobotConfig, parent: str
+) -> tuple[mujoco.MjsBody, NDArray[np.float64]]:
+    """The body that is the parent of a mount or carries this link of the URDF, and the link in it, shape (4, 4).
+
+    Raises:
+        KinematicsError: if there is no such body and link.
+    """
+    if parent in ("world", _base(spec)):
+        return spec.worldbody, np.eye(4)
+    if (body := spec.body(parent)) is not None:
+        return body, np.eye(4)
+    bodies = ", ".join(each.name for each in spec.bodies)
+    urdf = read_urdf(config.robot.description.urdf) if config.robot.description.urdf is not None else None
+    if urdf is None or parent not in urdf.links:
+        raise KinematicsError(f"its parent {parent} is no link, and no body of the MJCF; these are: {bodies}")
+    # Links and bodies have names of their own; joints, and the place of the base, are the same in both.
+    chain = Chain(urdf, config.robot.joint_names, urdf.root, parent)
+    link = chain.pose(np.zeros(len(config.robot.joint_names)))
+    if not chain.names:
+        return spec.worldbody, link
+    body = spec.joint(chain.names[-1]).parent
+    model = Mjcf(path, spec).skeleton
+    data = mujoco.MjData(model)
+    data.qpos[[int(model.joint(name).qposadr[0]) for name in config.robot.joint_names]] = 0.0
+    mujoco.mj_kinematics(model, data)
+    at = int(model.body(body.name).id)
+    placed = homogeneous(data.xmat[at].reshape(3, 3), data.xpos[at])
+    return body, np.asarray(np.linalg.inv(placed) @ link)
 
 
 def _base(spec: mujoco.MjSpec) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import attrs
 import numpy as np
+from ibrobot_kinematics.link_chain import Chain
 from ibrobot_kinematics.poses import homogeneous
 from ibrobot_kinematics.rotations import from_rpy, quaternion
 from ibrobot_kinematics.urdf import Urdf, read_urdf
@@ -14,7 +15,6 @@ from ibrobot_provenance.files import replace_file
 
 from ibrobot_camera.calibration import load_info
 from ibrobot_camera.intrinsics.board import Board
-from ibrobot_camera.mounting.chain import Chain
 from ibrobot_camera.mounting.edit import with_transform
 from ibrobot_camera.mounting.episode import Source
 from ibrobot_camera.mounting.fit import Session

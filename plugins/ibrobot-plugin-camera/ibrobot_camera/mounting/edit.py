@@ -30,14 +30,14 @@ def with_transform(text: str, camera: str, values: Mapping[str, str | Sequence[f
         changed = _added(changed, _peripheral(changed, camera), _KEY, f"{{{flow}}}")
     else:
         for key, value in values.items():
-            found = _transform(changed, camera)
-            assert found is not None
-            node = _value(found, key)
+            mount = _transform(changed, camera)
+            assert mount is not None
+            node = _value(mount, key)
             if node is not None:
                 end = node.end_mark.index if node.value or not isinstance(node.value, str) else node.start_mark.index
                 changed = changed[: node.start_mark.index] + _text(value) + changed[end:]
             else:
-                changed = _added(changed, found, key, _text(value))
+                changed = _added(changed, mount, key, _text(value))
     _check(text, changed, camera, values)
     return changed
 
@@ -90,7 +90,7 @@ def _end(node: Node) -> int:
     while isinstance(node, MappingNode | SequenceNode) and not node.flow_style and node.value:
         last = node.value[-1]
         node = last[1] if isinstance(last, tuple) else last
-    return node.end_mark.index
+    return int(node.end_mark.index)
 
 
 def _check(before: str, after: str, camera: str, values: Mapping[str, str | Sequence[float]]) -> None:

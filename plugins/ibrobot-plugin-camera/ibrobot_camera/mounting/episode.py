@@ -46,7 +46,7 @@ _BLURRED = 0.75
 
 @attrs.define
 class Taken:
-    """The pictures that can be used, and what became of the others."""
+    """The pictures that can be used, and why others cannot."""
 
     shots: list[Shot] = attrs.field(factory=list)
     stops: int = 0
@@ -54,7 +54,7 @@ class Taken:
     """Why a picture cannot be used -> number of pictures."""
 
     def text(self) -> str:
-        """What became of the others, for messages."""
+        """How often the arm stood still, and why pictures cannot be used, for messages."""
         why = "; ".join(f"{count} {what}" for what, count in self.others.most_common())
         return f"the arm stood still {self.stops} times" + (f", but {why}" if why else "")
 

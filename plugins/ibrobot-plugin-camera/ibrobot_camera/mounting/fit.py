@@ -7,11 +7,11 @@ from itertools import islice
 
 import attrs
 import numpy as np
+from ibrobot_kinematics.link_chain import Chain
 from ibrobot_kinematics.rotations import exp
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from ibrobot_camera.mounting.chain import Chain
 from ibrobot_camera.mounting.closed import SOLVERS, nearest_rotation, solved
 from ibrobot_camera.mounting.shots import Lens, Shot
 from ibrobot_core.api import Vector
@@ -147,7 +147,7 @@ class Session:
 
         free = np.zeros(6 if self.board is not None else 12)
         soft = max(_SOFT * self.lens.size[0], _SOFTER * float(np.median(self.errors(camera, board))))
-        found = least_squares(
+        best = least_squares(
             distances,
             free,
             loss="soft_l1",
@@ -158,7 +158,7 @@ class Session:
             xtol=1e-6,
             max_nfev=20,
         )
-        return moved(np.asarray(found.x))
+        return moved(np.asarray(best.x))
 
 
 def _moved(pose: Vector, step: Vector) -> Vector:

@@ -35,15 +35,15 @@ _FITS_BETTER = 0.8
 
 
 def check_count(shots: int, *, measured: bool, seen: str) -> None:
-    """Check that there are enough pictures.
+    """Check that the pictures are enough.
 
     Args:
         shots: pictures with the board.
         measured: whether the place of the board was measured.
-        seen: what became of the other pictures.
+        seen: why other pictures cannot be used, for the message.
 
     Raises:
-        SensorError: if there are too few.
+        SensorError: if they are too few.
     """
     least = FEWEST_MEASURED if measured else FEWEST
     if shots < least:
@@ -87,9 +87,9 @@ def explain(session: Session, fit: Fit) -> None:
     """
     good = _GOOD * session.lens.size[0]
     bad = fit.typical > good or fit.used.mean() < LEAST_USED
-    found = min(_explanations(session), key=lambda each: each[0]) if bad else (np.inf, "")
-    if found[0] < min(good, _EXPLAINS * fit.typical):
-        raise SensorError(found[1])
+    error, reason = min(_explanations(session), key=lambda each: each[0]) if bad else (np.inf, "")
+    if error < min(good, _EXPLAINS * fit.typical):
+        raise SensorError(reason)
     if session.board is None:
         scale, error = _rescaled(session, fit)
         if abs(scale - 1) > _SQUARE and error < _FITS_BETTER * fit.typical:

@@ -113,7 +113,7 @@ def board_pose(view: View, lens: Lens, guess: Vector | None = None) -> Vector:
     else:
         turn, place = cv2.Rodrigues(guess[:3, :3])[0], guess[:3, 3].reshape(3, 1).copy()
     turn, place = cv2.solvePnPRefineLM(points, corners, lens.matrix, lens.distortion, turn, place)
-    return homogeneous(np.asarray(cv2.Rodrigues(turn)[0]), np.asarray(place).ravel())
+    return homogeneous(np.asarray(cv2.Rodrigues(turn)[0], np.float64), np.asarray(place, np.float64).ravel())
 
 
 def scaled(shots: Sequence[Shot], factor: float) -> list[Shot]:

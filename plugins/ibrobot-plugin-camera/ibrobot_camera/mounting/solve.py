@@ -76,7 +76,7 @@ def solve_mount(session: Session, seen: str = "") -> Mounting:
 
     Args:
         session: the pictures.
-        seen: what became of other pictures, for the message that these are too few.
+        seen: why other pictures cannot be used, for the message that these are too few.
 
     Raises:
         SensorError: if they cannot tell it; says why, and what to do.

@@ -5,40 +5,41 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+
+from ibrobot_core.api import Vector, did_you_mean
+from ibrobot_kinematics.errors import KinematicsError
 from ibrobot_kinematics.poses import homogeneous
 from ibrobot_kinematics.rotations import exp, from_rpy
 from ibrobot_kinematics.urdf import MOVING, Urdf, UrdfJoint
 
-from ibrobot_core.api import IbrobotError, Vector, did_you_mean
-
 
 class Chain:
-    """The joints between the link of a camera and the link of a board.
+    """The joints between two links.
 
     Args:
         urdf: the robot.
         joints: names of the robot's joints, in the order of their positions.
-        camera: the link that carries the camera.
-        board: the link that carries the board.
+        base: the link in which poses are given.
+        tip: the link whose poses they are.
 
     Raises:
-        IbrobotError: if the URDF lacks a link, or a joint between them moves that the robot YAML lacks.
+        KinematicsError: if the URDF lacks a link, or a joint between them moves that the robot YAML lacks.
     """
 
-    def __init__(self, urdf: Urdf, joints: Sequence[str], camera: str, board: str) -> None:
-        for link in (camera, board):
+    def __init__(self, urdf: Urdf, joints: Sequence[str], base: str, tip: str) -> None:
+        for link in (base, tip):
             if link not in urdf.links:
                 hint = did_you_mean(link, urdf.links, "its links")
-                raise IbrobotError(f"{urdf.path} has no link {link!r}{hint}")
-        ways = [urdf.chain(urdf.root, link) or () for link in (camera, board)]
+                raise KinematicsError(f"{urdf.path} has no link {link!r}{hint}")
+        ways = [urdf.chain(urdf.root, link) or () for link in (base, tip)]
         shared = 0
         while shared < min(map(len, ways)) and ways[0][shared] is ways[1][shared]:
             shared += 1
         self._ways = tuple(way[shared:] for way in ways)
         moving = [joint for way in self._ways for joint in way if joint.type in MOVING]
         if unknown := [joint.name for joint in moving if joint.name not in joints]:
-            raise IbrobotError(
-                f"{urdf.path}: {unknown[0]} moves between {camera} and {board}, but is not in robot.joints"
+            raise KinematicsError(
+                f"{urdf.path}: {unknown[0]} moves between {base} and {tip}, but is not in robot.joints"
             )
         self.names = tuple(joint.name for joint in moving)
         """The joints that move one against the other."""
@@ -47,9 +48,9 @@ class Chain:
         self._index = {name: joints.index(name) for name in self.names}
 
     def pose(self, positions: Vector) -> Vector:
-        """The board's link in the camera's link, shape (4, 4), for positions of all joints [rad or m], shape (J,)."""
-        camera, board = (self._placed(way, positions) for way in self._ways)
-        return np.asarray(np.linalg.inv(camera) @ board)
+        """The tip in the base, shape (4, 4), for positions of all joints [rad or m], shape (J,)."""
+        base, tip = (self._placed(way, positions) for way in self._ways)
+        return np.asarray(np.linalg.inv(base) @ tip)
 
     def _placed(self, way: Sequence[UrdfJoint], positions: Vector) -> Vector:
         placed = np.eye(4)

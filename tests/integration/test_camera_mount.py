@@ -1,0 +1,175 @@
+"""`ibrobot camera mount` of a recorded episode whose pictures MuJoCo has rendered, and what uses its result."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+from ibrobot_mujoco.gl import choose
+
+from ibrobot_core.errors import MissingDependency
+
+pytestmark = pytest.mark.integration
+
+ROBOT = Path("configs/so101.yaml")
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with episodes: `good`, `still` (the arm never stops), and `bare` (no calibration); and the truth."""
+    try:
+        chosen = {"MUJOCO_GL": choose()}
+    except MissingDependency as missing:
+        pytest.skip(f"nothing renders here: {missing}")
+    folder = tmp_path_factory.mktemp("mount")
+    done = subprocess.run(
+        [sys.executable, __file__, folder], env={**os.environ, **chosen, "PYTHONPATH": "benchmarks:tests/shared"},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def run(*arguments: str) -> tuple[int, str]:
+    """The exit status and output of `ibrobot camera mount`."""
+    from ibrobot_testing.command import command_line
+
+    ran = CliRunner().invoke(command_line("camera"), ["mount", *arguments, "--columns", "8", "--rows", "6"])
+    return ran.exit_code, ran.output + str(ran.exception or "")
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Path:
+    """A robot YAML of one's own."""
+    return Path(shutil.copy(ROBOT, tmp_path / "desk.yaml"))
+
+
+def test_the_mount_is_written_into_the_robot_yaml_and_used(recorded: Path, robot: Path) -> None:
+    from ibrobot_kinematics.frames import mounted
+    from ibrobot_mujoco.arm_view import ArmView
+    from ibrobot_web.objects import mounts
+
+    from ibrobot_core.api import CameraInfo, Header
+    from ibrobot_core.app import load_config
+
+    before = robot.read_text()
+    code, output = run(str(robot), str(recorded / "good"), "--camera", "wrist", "--on", "gripper_link", "--write")
+    assert code == 0, output
+    truth = np.loadtxt(recorded / "truth.txt")
+    transform = next(each for each in yaml.safe_load(robot.read_text())["peripherals"] if each["name"] == "wrist")[
+        "transform"
+    ]
+    assert transform["parent"] == "gripper_link"
+    assert 1000 * np.linalg.norm(np.array(transform["xyz"]) - truth[:3]) < 3.0
+    assert np.degrees(np.abs(np.array(transform["rpy"]) - truth[3:])).max() < 0.5
+    assert "left out: 10.5 s, " in output  # in it, the board has slipped
+    comments = [line.partition("#")[2] for line in before.splitlines() if "#" in line]
+    assert [line.partition("#")[2] for line in robot.read_text().splitlines() if "#" in line] == comments
+    config = load_config(robot)
+    (frame,) = mounted(config)
+    assert [each.child_frame_id for each in frame.transforms(0)] == ["wrist_frame", "wrist_optical_frame"]
+    (shown,) = mounts(config.peripherals)
+    assert (shown["parent"], shown["xyz"]) == ("gripper_link", transform["xyz"])
+    k = np.array([579.4, 0, 319.5, 0, 579.4, 239.5, 0, 0, 1])
+    view = ArmView(config, "wrist", CameraInfo(Header(0), 480, 640, k=k), (240, 320))
+    try:
+        assert not view.stands  # it moves with the gripper, whose link has another name in the MJCF
+        assert 0.02 < 1 - view.moving(np.zeros(6)).mean() < 0.9
+    finally:
+        view.close()
+
+
+@pytest.mark.parametrize(
+    ("episode", "more", "reason"),
+    [
+        ("still", (), "0 pictures can be used, at least 8 are needed: the arm stood still 0 times"),
+        ("bare", (), "the camera has no calibration on /camera/wrist/camera_info"),
+        ("good", ("--square", "12"), "times as large as stated: measure a row of them"),
+        ("blurred", (), r"but 20 pictures are blurred"),
+        ("good", ("--on", "gripper"), "has no link 'gripper'"),
+        ("good", ("--on", "base_link"), "no joint moves base_link against base_link"),
+        ("good", ("--board-at", "1,2"), "must be six numbers"),
+        ("good", ("--camera", "side"), "has no camera 'side'; it has: top, wrist"),
+        ("good", ("--camera", "top"), r"has no pictures (/camera/top/image_raw)"),
+    ],
+)
+def test_an_episode_that_cannot_tell_is_refused_with_the_reason(
+    recorded: Path, robot: Path, episode: str, more: tuple[str, ...], reason: str
+) -> None:
+    before = robot.read_text()
+    usual = ("--camera", "wrist", "--on", "gripper_link", "--write")
+    code, output = run(str(robot), str(recorded / episode), *usual, *more)
+    assert code != 0
+    assert reason in output
+    assert robot.read_text() == before
+
+
+def test_a_shipped_robot_is_not_written(recorded: Path) -> None:
+    code, output = run("so101", str(recorded / "good"), "--camera", "wrist", "--on", "gripper_link", "--write")
+    assert code != 0
+    assert "is shipped with ibrobot: `ibrobot config copy` makes a file of your own" in output
+
+
+def write_episodes(folder: Path) -> None:
+    """Record episodes of a simulated arm that looks at a board."""
+    import cv2
+    from camera_mount import BOARDS, FOCAL, HEIGHT, MATRIX, OPTICAL, USUAL, WIDTH, Scene, rig, slipped
+    from ibrobot_kinematics.rotations import rpy
+    from ibrobot_mcap.options import McapOptions
+    from ibrobot_mcap.recorder import McapRecorder
+    from ibrobot_ros2.jpeg import to_jpeg
+    from ibrobot_testing import host_context
+
+    from ibrobot_core.api import CameraInfo, EpisodeEnd, EpisodeStart, Header, Image, JointState
+    from ibrobot_core.app import find_config, installed_plugins, load_config
+
+    assert abs(MATRIX[0, 0] - FOCAL) < 1e-9
+    assert BOARDS["in hand"].columns == 8
+    config = load_config(find_config("so101", installed_plugins()), sim=True)
+    rng = np.random.default_rng(5)
+    each = rig(config, "in hand", rng)
+    mount = each.camera @ OPTICAL.T
+    np.savetxt(folder / "truth.txt", [*mount[:3, 3], *rpy(mount[:3, :3])])
+    info = CameraInfo(Header(0, "wrist_optical_frame"), HEIGHT, WIDTH, d=np.zeros(5), k=MATRIX.ravel())
+    shown = []
+    with Scene(config, each, folder) as scene:
+        for number, joints in enumerate(each.joints):
+            placed = each.board @ slipped(rng) if number in (3, 11) else each.board
+            shown.append(scene.picture(joints, placed))
+        between = scene.picture(USUAL["in hand"], each.board)
+    for name in ("good", "still", "bare", "blurred"):
+        recorder = McapRecorder(McapOptions(), host_context())
+        recorder.begin(EpisodeStart(folder / name, 1_000_000_000, {}, {}, any_topic=True))
+        now_ns = 1_000_000_000
+        if name != "bare":
+            recorder.write("/camera/wrist/camera_info", info, now_ns)
+        for joints, seen in zip(each.joints, shown, strict=True):
+            for step in range(30):  # 0.6 s in which the arm stands, after 0.3 s in which it moves
+                now_ns += 30_000_000
+                moves = step < 10 or name == "still"
+                at = joints + 0.02 * step if moves else joints
+                for part in range(3):
+                    stamp_ns = now_ns + 10_000_000 * part
+                    recorder.write(
+                        "/joint_states", JointState(Header(stamp_ns), config.robot.joint_names, at), stamp_ns
+                    )
+                picture = between if moves and name != "still" else seen
+                if name == "blurred":
+                    picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 9), np.uint8)
+                if step % 6 == 0:
+                    header = Header(now_ns, "wrist_optical_frame")
+                    image = Image(header, HEIGHT, WIDTH, "rgb8", 3 * WIDTH, np.ascontiguousarray(picture).reshape(-1))
+                    recorder.write("/camera/wrist/image_raw", to_jpeg(image, 90), now_ns)
+        recorder.end(EpisodeEnd(now_ns, "success"))
+        recorder.close()
+
+
+if __name__ == "__main__":
+    write_episodes(Path(sys.argv[1]))
