@@ -27,6 +27,8 @@ from ibrobot_diagnose.watch import LiveWindow, Watch
 
 _EVERY_S = 0.2
 """Time between two pictures [s]."""
+_EDGE = 10.0
+"""Gradient of the grey values from which a line is drawn."""
 _LEAST_WAY = 1.0
 """Displacement from which a direction is named [pixels of 640]."""
 _LEAST_ROLL = 0.005
@@ -59,7 +61,7 @@ def refit(answers: Mapping[str, str | bool], guide: Guide) -> None:
         raise HardwareError(f"the reference has no camera {name!r}; it has: {there}")
     with looking(config) as (runtime, watch), closing(Refit(config, card.rig, known[0], runtime, watch)) as fitting:
         guide.wait(
-            "Turn the camera until both pictures are one: red is then, cyan is now. Where they fit, they are grey.",
+            "Turn the camera until what it sees lies on the red lines: they are where things were in the reference.",
             columns=("camera", ">shift [px of 640]", "what to do"), rows=fitting.rows, sight=fitting.picture,
         )  # fmt: skip
         guide.say(fitting.verdict, warning=not fitting.fits)
@@ -143,10 +145,10 @@ class Refit:
             return [name, "", "" if sight is None else sight.unclear]
         if sight.unclear:
             return [name, "", f"uncertain: {sight.unclear}"]
-        return [name, f"{sight.pixels:.1f}", "it fits" if sight.stays else _turns(sight)]
+        return [name, f"{sight.pixels:.1f}", "it fits" if sight.stays else turns(sight)]
 
 
-def _turns(sight: Sight) -> str:
+def turns(sight: Sight) -> str:
     """How to turn a camera, as seen from behind it."""
     assert sight.moved is not None
     if sight.moved.is_other_view:
@@ -163,7 +165,7 @@ def _turns(sight: Sight) -> str:
 
 
 def overlay(then: NDArray[np.uint8], now: NDArray[np.uint8]) -> bytes:
-    """Two pictures over one another as JPEG: then in red, now in cyan, so that what fits is grey.
+    """The picture of now with the edges of the picture of then in red, as JPEG.
 
     Raises:
         IbrobotError: if their sizes differ.
@@ -171,7 +173,9 @@ def overlay(then: NDArray[np.uint8], now: NDArray[np.uint8]) -> bytes:
     if then.shape != now.shape:
         sizes = [f"{each.shape[1]}x{each.shape[0]}" for each in (now, then)]
         raise IbrobotError(f"the pictures have {sizes[0]} pixels, those of the reference {sizes[1]}")
-    shades = [grey(each).round().astype(np.uint8) for each in (then, now, now)]
+    edges = np.hypot(*np.gradient(grey(then))) > _EDGE
+    shown = now.copy()
+    shown[edges] = (255, 0, 0)
     file = io.BytesIO()
-    Image.fromarray(np.stack(shades, axis=2)).save(file, "JPEG", quality=85)
+    Image.fromarray(shown).save(file, "JPEG", quality=90, subsampling=0)
     return file.getvalue()
