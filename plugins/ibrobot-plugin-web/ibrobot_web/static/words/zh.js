@@ -501,7 +501,6 @@ export default {
   "Put a camera back": "把相机放回原位",
   "Show what a camera sees over what it saw in a reference of `ibrobot preflight`, until it fits again.": "把相机现在看到的画面与 `ibrobot preflight` 参考中的画面叠加显示，直到重新吻合。",
   "Turn the camera until what it sees lies on the red lines: they are where things were in the reference.": "转动相机，直到画面与红线重合：红线是参考中物体所在的位置。",
-  "Robot YAML": "机器人 YAML",
   "Reference, dataset or checkpoint": "参考、数据集或检查点",
   "Use its simulation": "使用其仿真",
   "What the camera sees": "相机看到的画面",
