@@ -13,6 +13,7 @@ for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIG
         signal.signal(number, handler)
 
 os.environ["IBROBOT_INSTALLER"] = "pip install"  # in remedies, whatever installed what runs here
+os.environ.pop("UV_RUN_RECURSION_DEPTH", None)  # with it, the commands in messages begin with `uv run`
 
 settings.register_profile("untimed", deadline=None)
 settings.register_profile("few", deadline=None, max_examples=5)  # where another run looks for rare examples

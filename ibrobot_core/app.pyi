@@ -41,7 +41,6 @@ from ibrobot_core.config.overrides import (
     apply_overrides as apply_overrides,
     single_options as single_options,
 )
-from ibrobot_core.config.missing import unavailable_modes as unavailable_modes
 from ibrobot_core.config.yaml_nodes import Document as Document, parse_yaml as parse_yaml
 from ibrobot_core.config.show import dump_yaml as dump_yaml, plain as plain
 
@@ -74,7 +73,7 @@ from ibrobot_core.launch.episodes import Episodes as Episodes
 from ibrobot_core.component import TransportLink as TransportLink
 from ibrobot_core.launch.models import check_models as check_models
 from ibrobot_core.inference.build import build_policy as build_policy
-from ibrobot_core.launch.absence import absent_sensors as absent_sensors, describe_absent as describe_absent
+from ibrobot_core.launch.absence import absent_sensors as absent_sensors, notes_of as notes_of
 
 # Sources
 from ibrobot_core.component import SourceWorker as SourceWorker

@@ -7,6 +7,7 @@ output goes through `echo`, `LogFormatter`, or the `Screen` of `ibrobot_core.scr
 from __future__ import annotations
 
 import logging
+import os
 import re
 import sys
 from typing import override
@@ -21,6 +22,8 @@ _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e
 """Control characters except tab and line feed, characters that change the text direction, and lone surrogates."""
 _CREDENTIALS = re.compile(r"(?P<scheme>\b[A-Za-z][A-Za-z0-9+.-]*://)[^\s/?#]*@")
 _PARAMETERS = re.compile(r"(?i)(?P<name>[?&](?:user(?:name)?|pass(?:word|wd)?|pwd|secret)=)[^&\s#'\"]+")
+_TYPED = "`uv run ibrobot " if "UV_RUN_RECURSION_DEPTH" in os.environ else "`ibrobot "
+"""How commands in texts begin: below `uv run`, the shell may not find `ibrobot` itself."""
 SHORTEST = 8
 """Shorter secrets are hidden only in their options: their characters occur elsewhere, e.g. in names of files."""
 
@@ -46,8 +49,12 @@ def redacted(text: str) -> str:
 
 
 def printable(text: str) -> str:
-    r"""Make a text safe to show: escape unprintable characters as in JSON and YAML, e.g. `\u001b`, and hide secrets."""
-    return _UNPRINTABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", redacted(text))
+    r"""Make a text safe to show, and its commands as the user types them.
+
+    Unprintable characters are escaped as in JSON and YAML, e.g. `\u001b`, and secrets hidden.
+    """
+    text = redacted(text).replace("`ibrobot ", _TYPED)
+    return _UNPRINTABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 def echo(message: object = "", *, err: bool = False, nl: bool = True) -> None:

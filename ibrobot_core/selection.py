@@ -87,9 +87,8 @@ class Selection:
             self.paths = tuple(select)
             leaves = [Leaf(path, "foreign") for path in select]
         elif message_type is None:
-            raise ContractError(
-                f"unknown message type {type_name!r}{did_you_mean(type_name, list(MESSAGE_TYPES), 'available')}"
-            )
+            hint = did_you_mean(type_name, list(MESSAGE_TYPES), "available")
+            raise ContractError(f"unknown message type {type_name!r}{hint}")
         else:
             self.paths = tuple(select) or _default(message_type, joints)
             leaves = [
@@ -137,9 +136,8 @@ def _resolve(message_type: type[Any], path: str) -> list[Leaf]:
     for depth, token in enumerate(tokens):
         kinds = _kinds(owner)  # type: ignore[arg-type]  # a class has a hash
         if token not in kinds:
-            raise ContractError(
-                f"{path!r}: {owner.__name__} has no field {token!r}{did_you_mean(token, list(kinds), 'available')}"
-            )
+            hint = did_you_mean(token, list(kinds), "available")
+            raise ContractError(f"{path!r}: {owner.__name__} has no field {token!r}{hint}")
         kind, field, rest = kinds[token], ".".join(tokens[: depth + 1]), ".".join(tokens[depth + 1 :])
         if attrs.has(kind):
             owner = kind

@@ -89,3 +89,11 @@ def test_only_tests_need_the_conformance_suites(folder: Path) -> None:
     settings = project(folder)
     needed = [settings["dependencies"], *settings.get("optional-dependencies", {}).values()]
     assert [text for group in needed for text in group if "ibrobot-testing" in text] == []
+
+
+@pytest.mark.parametrize("page", ["README.md", "README.zh.md", "docs/how-to/install.md"])
+def test_pages_name_the_address_of_the_repository_once_it_has_one(page: str) -> None:
+    """`Repository` of `[project.urls]` in pyproject.toml is that address; without it, no page may make one up."""
+    address = project(ROOT).get("urls", {}).get("Repository")
+    cloned = re.findall(r"^\s*\$ git clone (\S+)", (ROOT / page).read_text(), re.MULTILINE)
+    assert set(cloned) == ({address} if address else set()), f"git clone {address}"

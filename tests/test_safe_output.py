@@ -6,7 +6,10 @@ import ast
 import io
 import json
 import logging
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -180,3 +183,13 @@ def test_all_text_goes_one_way():
 )
 def test_the_check_finds_ways_around(code: str):
     assert list(ways_around(ast.parse(code)))
+
+
+@pytest.mark.parametrize("depth", [None, "1"])
+def test_commands_in_texts_are_as_the_shell_finds_them(depth: str | None) -> None:
+    """`uv run` puts the environment's programs on the path of what it starts, not on that of the shell."""
+    code = "from ibrobot_core.safe_output import echo; echo('an ibrobot: run `ibrobot doctor`, then `ibrobot ui`')"
+    environ = {**os.environ, **({"UV_RUN_RECURSION_DEPTH": depth} if depth else {})}
+    ran = subprocess.run([sys.executable, "-c", code], env=environ, check=True, capture_output=True, text=True)
+    program = "uv run ibrobot" if depth else "ibrobot"
+    assert ran.stdout == f"an ibrobot: run `{program} doctor`, then `{program} ui`\n"

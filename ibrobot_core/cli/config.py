@@ -7,7 +7,7 @@ import json
 import attrs
 
 from ibrobot_core.cli.options import ConfigOptions
-from ibrobot_core.config.missing import absent_models, describe, unavailable_modes
+from ibrobot_core.config.missing import describe
 from ibrobot_core.descriptors import UnitsDescriptor
 from ibrobot_core.errors import ConfigError, PluginError, Unsuccessful
 from ibrobot_core.options import option
@@ -45,14 +45,15 @@ class CheckConfig(ShowConfig):
 
     def __call__(self) -> None:
         from ibrobot_core.contract.specs import Contract
-        from ibrobot_core.launch.absence import absent_sensors, describe_absent
+        from ibrobot_core.launch.absence import notes_of
         from ibrobot_core.launch.models import check_models
 
+        registry = installed_plugins()
         try:
             robot = self.load(self.mode)
             modes = [name for name in robot.control_modes if name not in robot.unavailable]
-            models = check_models(robot, installed_plugins(), modes) if self.deep else []
-            units = [each for each in installed_plugins().of_kind("units") if isinstance(each, UnitsDescriptor)]
+            models = check_models(robot, registry, modes) if self.deep else []
+            units = [each for each in registry.of_kind("units") if isinstance(each, UnitsDescriptor)]
             uncalibrated = [problem for each in units for problem in each.uncalibrated(robot)]
             if self.deep and uncalibrated:
                 raise ConfigError(uncalibrated)
@@ -68,10 +69,7 @@ class CheckConfig(ShowConfig):
         echo(f"{robot.source}: ok ({robot.robot.name}, {len(robot.robot.joints)} joints, {body})")
         echo(f"joints brake from full speed within {robot.robot.braking_s.max() * 1e3:.0f} ms")
         echo(f"modes: {', '.join(robot.control_modes)}; starts in {robot.default_control_mode}")
-        notes = [*unavailable_modes(robot.unavailable), *absent_models(robot.absent_models)]
-        if absent := describe_absent(absent_sensors(robot, installed_plugins())):
-            notes.append(f"runs start without {absent}")
-        notes += [f"{problem.path}: {problem.message}" for problem in uncalibrated]
+        notes = [*notes_of(robot, registry), *(f"{problem.path}: {problem.message}" for problem in uncalibrated)]
         for spec, part in zip(robot.contract.observations, Contract.from_config(robot).observation_parts, strict=True):
             if part.align != spec.align:
                 notes.append(f"{part.key}: a {part.type} has no header: {part.topic} goes by the time of receipt")

@@ -41,8 +41,7 @@ class Doctor:
 def examine(registry: Registry) -> list[Check]:
     """Run all checks: Python, plugins and their checks, dependencies of types, real-time permissions."""
     python = Check("python", True, platform.python_version())  # an older one cannot import this file
-    devices = (realtime(), memory_lock())
-    return [python, *plugin_checks(registry), *registry.doctor(), *types(registry), *devices]
+    return [python, *plugin_checks(registry), *registry.doctor(), *types(registry), realtime(), memory_lock()]
 
 
 def plugin_checks(registry: Registry) -> list[Check]:

@@ -139,14 +139,6 @@ def _replace_closed_streams() -> None:
             setattr(sys, name, open(number, mode, encoding="utf-8", closefd=False))  # noqa: SIM115
 
 
-def _has_working_folder() -> bool:
-    try:
-        os.getcwd()
-    except FileNotFoundError:
-        return False
-    return True
-
-
 def _suggestion(message: str, ctx: click.Context | None) -> str:
     """The command that a mistyped one resembles."""
     mistyped = re.fullmatch(r"No such command '(.*)'", message)
@@ -180,6 +172,9 @@ def _system_error(error: OSError) -> tuple[list[str], int] | None:
 
         discard([1])  # so that the interpreter does not try to write it once more
         return [f"standard output: {error.strerror}"], _FAILED
-    if isinstance(error, FileNotFoundError) and not _has_working_folder():
-        return ["the working folder no longer exists: change to another one"], _WRONG
+    if isinstance(error, FileNotFoundError):
+        try:
+            os.getcwd()
+        except FileNotFoundError:
+            return ["the working folder no longer exists: change to another one"], _WRONG
     return None

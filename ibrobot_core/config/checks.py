@@ -358,7 +358,8 @@ class Checks:
 
     def _folder(self, key: Key, folder: Path) -> None:
         """Check that a folder exists or can be made."""
-        nearest = _nearest(folder.absolute())
+        folder = folder.absolute()
+        nearest = next(each for each in (folder, *folder.parents) if each.exists())  # the innermost that is there
         if not nearest.is_dir():
             self.document.add(key, f"{nearest} is a file, not a folder")
         elif not os.access(nearest, os.W_OK | os.X_OK):
@@ -371,18 +372,12 @@ class Checks:
         if isinstance(topics, str) and topics not in ("contract", "all"):
             self.document.add(("recording", "topics"), f"{topics!r} is not one of: contract, all, or a list of topics")
         elif not topics and self.sections.recording:
-            self.document.add(
-                ("recording", "topics"), "is empty; write contract for the contract's topics, or all for every topic"
-            )
+            message = "is empty; write contract for the contract's topics, or all for every topic"
+            self.document.add(("recording", "topics"), message)
         for i, topic in enumerate(topics if isinstance(topics, tuple) else ()):
             if not topic.startswith("/"):
                 message = f"{topic!r} is not a full topic name, did you mean '/{topic}'?"
                 self.document.add(("recording", "topics", i), message)
-
-
-def _nearest(path: Path) -> Path:
-    """The innermost existing part of a path."""
-    return next(each for each in (path, *path.parents) if each.exists())
 
 
 def streams(part: ParsedComponent[Any]) -> bool:

@@ -100,9 +100,8 @@ class ContractChecks:
             hint = "(set `foreign: true` for a type that only bags define)"
             self.document.add((*key, "type"), f"unknown message type {spec.type!r}{remark} {hint}")
         elif spec.topic == messages.JOINT_STATES and spec.type != messages.JointState.ros_type:
-            self.document.add(
-                (*key, "type"), f"{messages.JOINT_STATES} carries {messages.JointState.ros_type}, not {spec.type}"
-            )
+            message = f"{messages.JOINT_STATES} carries {messages.JointState.ros_type}, not {spec.type}"
+            self.document.add((*key, "type"), message)
         else:
             self._fits(key, spec)
         return spec
@@ -228,10 +227,8 @@ class ContractChecks:
             spec = attrs.evolve(spec, select=())  # their plugin checks them
         if not spec.foreign:
             if spec.type != own:
-                message = (
-                    f"this robot publishes {own}, not {spec.type!r}; set foreign: true for the commands of foreign bags"
-                )
-                self.document.add((*key, "type"), message)
+                message = f"this robot publishes {own}, not {spec.type!r}"
+                self.document.add((*key, "type"), f"{message}; set foreign: true for the commands of foreign bags")
             elif spec.select:
                 self.document.add((*key, "select"), _NO_FEATURE.format(spec.select[0]))
         elif not _TYPE_NAME.fullmatch(spec.type):

@@ -115,9 +115,8 @@ class SectionParser:
         sections = ParsedSections(simulated, missing=self._missing)
         self._sections(sections)
         if simulated and "simulation" not in given:
-            self.document.add(
-                (), f"--sim needs a simulation section, e.g. simulation: {{type: {example_type('hardware')}}}"
-            )
+            example = f"simulation: {{type: {example_type('hardware')}}}"
+            self.document.add((), f"--sim needs a simulation section, e.g. {example}")
         elif not simulated and "hardware" not in given:
             self.document.add((), "needs a hardware section, a simulation section, or both")
         self._simulation(sections)

@@ -43,9 +43,8 @@ class _Part:
             raise ContractError(f"{self.part.key}: {self.part.topic} is a {self.part.type}, got a {message.ros_type}")
         known = MESSAGE_TYPES.get(message.ros_type)
         if known is not None and not isinstance(message, known):
-            raise ContractError(
-                f"{self.part.key}: {self.part.topic}: its bag defines {message.ros_type} otherwise than ROS 2 does"
-            )
+            where = f"{self.part.key}: {self.part.topic}"
+            raise ContractError(f"{where}: its bag defines {message.ros_type} otherwise than ROS 2 does")
         stamp_ns = getattr(getattr(message, "header", None), "stamp_ns", None)
         if stamp_ns is None and self.part.align.stamp == "header":  # of a type that only the bag defines
             raise ContractError(f"{self.part.key}: a {self.part.type} has no header; give `align: {{stamp: receive}}`")

@@ -22,7 +22,7 @@ from ibrobot_core.control.phase import TRANSITIONS, Cause, Phase
 from ibrobot_core.control.pose_motion import TIMEOUT_S, PoseMotion
 from ibrobot_core.control.readings import Readings
 from ibrobot_core.control.safety import SafetyLayer
-from ibrobot_core.control.timing import Pace
+from ibrobot_core.control.timing import TOO_BUSY, Pace
 from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported
 from ibrobot_core.interfaces import EpisodeSetup, Executor, Guard, JointReading, Signal, Torque
 from ibrobot_core.interfaces.executor import ExecutorGoal
@@ -227,7 +227,7 @@ class ControlCore:
         self._commanded_ns = self._clock.now_ns()
         self._executors.set_plan(plan, self._at_tick)
 
-    def note_silence(self, silent_s: float, fault: str) -> None:
+    def note_silence(self, silent_s: float, fault: str, *, stopped: bool = False) -> None:
         """Raise a fault if braking must begin for motion to end within `control.peer_timeout` of a silence.
 
         A robot that nobody commands needs none: at rest, without a policy, and without a plan for a second.
@@ -235,13 +235,15 @@ class ControlCore:
         Args:
             silent_s: how long the host, or this loop, has not run [s].
             fault: what happened.
+            stopped: whether a signal stopped the process, as Ctrl-Z does.
         """
         longest_s = self._config.control.peer_timeout
         if silent_s <= longest_s / 3 or self.fault or self.phase is Phase.STOPPING or not self._is_commanded:
             return
         braking_s = float(np.max(np.abs(self._safety.velocity) / self._robot.max_acceleration))
         if silent_s + braking_s >= longest_s:
-            self._raise_fault(f"{fault} for {silent_s * 1e3:.0f} ms")
+            remedy = f"; {TOO_BUSY}" if self._config.simulated and not stopped else ""
+            self._raise_fault(f"{fault} for {silent_s * 1e3:.0f} ms{remedy}")
 
     def handle(self, command: commands.Command) -> dict[str, Any]:
         """Execute a command of the host and return the answer; that to a refused command has the key `error`."""
@@ -290,7 +292,7 @@ class ControlCore:
 
     def holding(self) -> list[str]:
         """One line for each part that holds torque, with the command that switches it off. Also valid after `close`."""
-        return [f"{each.where} holds torque; to take it off: {each.command}" for each in self._hardware.holding()]
+        return [f"{each.where} holds torque; to take it off: `{each.command}`" for each in self._hardware.holding()]
 
     @property
     def signals(self) -> tuple[Signal, ...]:

@@ -20,7 +20,7 @@ from ibrobot_core.config import RobotConfig
 from ibrobot_core.control import commands
 from ibrobot_core.control.build import build_core
 from ibrobot_core.control.link import LinkLayout, SharedMemory, raise_error
-from ibrobot_core.control.timing import REPORT_TICKS, Punctuality
+from ibrobot_core.control.timing import REPORT_TICKS, TOO_BUSY, Punctuality
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError
 from ibrobot_core.interfaces.run_state import ControlState, PlanRecord
 from ibrobot_core.memory import create_memory
@@ -457,6 +457,8 @@ class ControlClient(ControlHost):
 
     def _describe_silence(self, pid: int, silent_s: float, *, stopped: bool) -> str:
         what = "is stopped" if stopped else f"has been silent for {silent_s * 1e3:.0f} ms"
+        if self._config.simulated and not stopped:
+            return f"the control process {pid} {what}; {TOO_BUSY}"
         ways = ["Ctrl-C ends the run"] if self._config.simulated else ["switch off the power of its motors"]
         ways += [f"`kill -CONT {pid}` continues the process"] if stopped else []
         return f"the control process {pid} {what}, and STOP does not reach the robot: {', or '.join(ways)}"

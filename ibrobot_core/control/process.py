@@ -126,8 +126,9 @@ class ControlProcess:
         self._core.note_silence((late + self._core.period_ns) / NS_PER_S, "the control loop has not run")
         silent_s = (now_ns - self._heard_ns) / NS_PER_S if beats else 0.0
         if silent_s > _GLANCE_S:
-            stopped = " is stopped, and" if is_stopped(self._host) else ""
-            self._core.note_silence(silent_s, f"the host process {self._host}{stopped} has been silent")
+            stopped = is_stopped(self._host)
+            fault = f"the host process {self._host}{' is stopped, and' if stopped else ''} has been silent"
+            self._core.note_silence(silent_s, fault, stopped=stopped)
 
     def _handle_commands(self) -> bool:
         """Execute the host's commands; return whether this took longer than a period."""

@@ -89,9 +89,8 @@ class SafetyLayer:
             raise HardwareError(f"measured positions must be {len(self._names)} numbers, got {measured!r}")
         if not np.isfinite(position).all():
             joint = int(np.argmin(np.isfinite(position)))
-            raise HardwareError(
-                f"joint {self._names[joint]} is measured at {position[joint]}, which is not a valid position"
-            )
+            place = f"joint {self._names[joint]} is measured at {position[joint]}"
+            raise HardwareError(f"{place}, which is not a valid position")
         self._position = position.copy()
         self._step = np.zeros_like(position)
         self._target = self._nothing

@@ -10,6 +10,8 @@ from ibrobot_core.units import NS_PER_S
 
 REPORT_TICKS = 20
 """Ticks between two reports of timing and counters to the host."""
+TOO_BUSY = "this machine is too busy to simulate in real time: with `--lockstep`, simulated time waits for it"
+"""What to say of a process of a simulation that was silent, without having been stopped."""
 _LEAST_SHARE = 0.9
 """Share of the rate below which a loop is slow."""
 _BINS = 20_001

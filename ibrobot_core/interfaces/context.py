@@ -59,6 +59,8 @@ class Context:
     """For engines: the model, whose name is that of the context."""
     session: RunView | None = None
     """The run, for what is made in its process; None elsewhere."""
+    source: str = ""
+    """The robot YAML if the robot can be simulated, for messages; else empty."""
 
     @classmethod
     def of(cls, config: RobotConfig, name: str, clock: Clock, seed: int = 0, **more: Any) -> Self:
@@ -71,8 +73,8 @@ class Context:
             seed: the seed of the run.
             more: other fields; `joints` defaults to all joints of the robot.
         """
-        simulation = config.simulation.options if config.simulation is not None else None
+        simulation, source = (config.simulation.options, str(config.source)) if config.simulation else (None, "")
         robot: Robot = more.get("robot", config.robot)
-        given = {"robot": robot, "joints": robot.joint_names, "simulation": simulation, **more}
+        given = {"robot": robot, "joints": robot.joint_names, "simulation": simulation, "source": source}
         log, period_ns = logging.getLogger(f"ibrobot.{name}"), ns(1.0 / config.control.rate_hz)
-        return cls(name=name, clock=clock, log=log, period_ns=period_ns, seed=seed, **given)
+        return cls(name=name, clock=clock, log=log, period_ns=period_ns, seed=seed, **given | more)

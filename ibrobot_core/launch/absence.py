@@ -1,10 +1,14 @@
-"""Sensors that cannot run on this machine. A run continues without them, but refuses parts that need their messages."""
+"""Sensors that cannot run on this machine, and what else a robot lacks here.
+
+A run continues without the sensors, but refuses parts that need their messages.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
 from ibrobot_core.config import RobotConfig
+from ibrobot_core.config.missing import absent_models, unavailable_modes
 from ibrobot_core.errors import MissingDependency, PluginNotInstalled
 from ibrobot_core.interfaces.run_state import AbsentSensor
 from ibrobot_core.plugins import Registry
@@ -28,6 +32,21 @@ def absent_sensors(config: RobotConfig, registry: Registry) -> tuple[AbsentSenso
             raise missing
         absent.append(AbsentSensor(name, f"{peripheral.kind} {name}", peripheral.published, missing))
     return tuple(absent)
+
+
+def notes_of(config: RobotConfig, registry: Registry) -> list[str]:
+    """What a valid robot lacks on this machine: plugins, sensors and system libraries, with the remedies.
+
+    Raises:
+        MissingDependency: as `absent_sensors`.
+    """
+    notes = [*unavailable_modes(config.unavailable), *absent_models(config.absent_models)]
+    if absent := describe_absent(absent_sensors(config, registry)):
+        notes.append(f"runs start without {absent}")
+    modes = [mode for name, mode in config.control_modes.items() if name not in config.unavailable]
+    planners = [("planner", mode.planner.type) for mode in modes if mode.planner is not None]
+    used = [*(("section", each.type) for each, _ in registry.sections(config)), *planners]
+    return notes + list(dict.fromkeys(str(lack) for each in used if (lack := registry.missing(*each)) is not None))
 
 
 def describe_absent(absent: Iterable[AbsentSensor]) -> str:

@@ -112,9 +112,8 @@ class ControlComponent(Component):
             return
         passed_s, self._checked_s = now_s - self._checked_s, now_s
         for late in [pulse for pulse in set(session.pulses) if pulse.is_late(passed_s)]:
-            session.fail(
-                late.name, ComponentFailed(f"does not react for {late.longest_s:g} s: STOP would be late there")
-            )
+            failure = f"does not react for {late.longest_s:g} s: STOP would be late there"
+            session.fail(late.name, ComponentFailed(failure))
         ending = session.finished.is_set() and not session.stopping.is_set()
         self._ending_s = self._ending_s + min(passed_s, 2 * PULSE_S) if ending else 0.0
         if self._ending_s > _PATIENCE_S and not self._held:

@@ -409,7 +409,7 @@ def test_options_that_make_no_sense_are_refused(launch: Callable[..., Ran], argu
 def test_what_holds_torque_is_said_however_the_run_ends(launch, mode):
     ran = launch("--sim", "--lockstep", "--headless", "--mode", mode, "--duration", "2", "--seed", "7")
 
-    assert ran.err.count("/dev/ttyARM holds torque; to take it off: arm torque off") == 1
+    assert ran.err.count("/dev/ttyARM holds torque; to take it off: `arm torque off`") == 1
 
 
 STEPPED = """

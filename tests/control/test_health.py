@@ -235,7 +235,7 @@ class TestHolding:
         rig.stop()
         rig.core.close()
 
-        assert rig.core.holding() == ["hardware holds torque; to take it off: scripted off hardware"]
+        assert rig.core.holding() == ["hardware holds torque; to take it off: `scripted off hardware`"]
 
     def test_nothing_holds_after_relax(self, make_rig):
         rig = make_rig({"control": {"stop": "relax"}}).start()
@@ -260,7 +260,7 @@ class TestHolding:
             rig.core.start("stream")
 
         assert "torque of hand cannot be taken off: servo 6 keeps it" in caplog.text
-        assert rig.core.holding() == ["hand holds torque; to take it off: scripted off hand"]
+        assert rig.core.holding() == ["hand holds torque; to take it off: `scripted off hand`"]
 
     def test_a_start_without_a_first_reading_does_not_hold(self, make_rig):
         rig = make_rig({})

@@ -151,14 +151,14 @@ class TestBoth:
         host.start()
         host.stop(unmoved=unmoved)
 
-        assert host.holding == ["/dev/ttyARM holds torque; to take it off: arm torque off"] * lines
+        assert host.holding == ["/dev/ttyARM holds torque; to take it off: `arm torque off`"] * lines
 
     def test_what_holds_torque_after_a_failed_start_is_reported(self, make, kind):
         host = make(kind, holds=True, trouble="connect")
         with pytest.raises(HardwareError):
             host.start()
 
-        assert host.holding == ["/dev/ttyARM holds torque; to take it off: arm torque off"]
+        assert host.holding == ["/dev/ttyARM holds torque; to take it off: `arm torque off`"]
 
     @pytest.mark.parametrize("trouble", ["connect", "read"])
     def test_hardware_that_does_not_answer_is_reported_and_released(self, make, kind, tmp_path, trouble):
@@ -465,7 +465,9 @@ class TestProcess:
         beats.close()
 
         fault = reports.events.get(timeout=PATIENCE_S)
-        assert re.fullmatch(rf"the host process {os.getpid()} has been silent for \d+ ms", fault["fault"])
+        assert re.fullmatch(
+            rf"the host process {os.getpid()} has been silent for \d+ ms; .*--lockstep.*", fault["fault"]
+        )
 
     def test_sigterm_stops_it_in_order(self, make, reports, tmp_path):
         host = make(closed=str(tmp_path / "closed"))

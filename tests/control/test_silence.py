@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import attrs
 import numpy as np
 import pytest
@@ -114,3 +116,17 @@ def test_a_goal_counts_as_a_command(make_rig):
     assert "error" not in rig.call(SendGoal("arm_trajectory", "1", FollowTrajectory(trajectory)))
 
     assert silent(rig, PEER_TIMEOUT_S)
+
+
+@pytest.mark.parametrize(
+    ("simulated", "stopped", "has"), [(True, False, True), (True, True, False), (False, False, False)]
+)
+def test_a_silence_of_a_simulation_on_a_busy_machine_names_lockstep(make_rig, simulated, stopped, has):
+    rig = make_rig({}).start()
+    rig.core._config = attrs.evolve(rig.core._config, simulated=simulated)
+    rig.plan([0.9, 1.4, 0.9], seconds=3.0)
+    rig.tick(20)
+    rig.core.note_silence(1.0, "the host has been silent", stopped=stopped)
+
+    assert re.fullmatch("the host has been silent for 1000 ms(; .* `--lockstep`.*)?", rig.core.fault)
+    assert ("--lockstep" in rig.core.fault) == has

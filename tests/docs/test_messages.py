@@ -67,9 +67,9 @@ REMEDIES = {
     "ibrobot feetech check": f"{_FEETECH}/test_commands.py::test_drift_is_reported_and_written_back",
     "ibrobot feetech check X --name X --write": f"{_FEETECH}/test_commands.py::"
     "test_a_servo_that_dies_while_being_written_leaves_a_state_that_check_repairs",
-    "ibrobot feetech emulate --physics CONFIG": "tests/integration/test_feetech_pick.py::"
+    "ibrobot feetech emulate --physics X --link X": "tests/integration/test_feetech_pick.py::"
     "test_cube_lies_in_the_bin_and_only_the_emulator_says_so",
-    "ibrobot feetech emulate --physics CONFIG --link X --calibration X": "tests/integration/test_feetech_pick.py::"
+    "ibrobot feetech emulate X--link X --calibration X": "tests/integration/test_feetech_pick.py::"
     "test_cube_lies_in_the_bin_and_only_the_emulator_says_so",
     "ibrobot feetech find-port": f"{_FEETECH}/test_commands.py::"
     "test_the_port_is_found_by_pulling_its_cable_and_putting_it_back",

@@ -80,7 +80,7 @@ def kitchen(tmp_path: Path) -> Path:
 def test_a_drafted_contract_converts_the_bag_that_it_is_from(kitchen: Path) -> None:
     drafted = ibrobot(kitchen, "contract", "init", "kitchen", "-o", "kitchen.yaml")
     assert drafted.returncode == 0, drafted.stderr
-    assert "kitchen.yaml: read it, then ibrobot convert kitchen --config kitchen.yaml" in drafted.stdout
+    assert "kitchen.yaml: read it, then `ibrobot convert kitchen --config kitchen.yaml" in drafted.stdout
     assert (kitchen / "kitchen.yaml").read_text().count("# CHOOSE") >= 5
     done = ibrobot(
         kitchen, "convert", "kitchen", "--config", "kitchen.yaml", "--prompt", "clear", "--out", "set", "--json"

@@ -139,7 +139,7 @@ def test_so_does_ctrl_c(bench: Bench, stop: str, torque: bool) -> None:
     assert counts["requests"] > 0
     assert counts["bad_packets"] == counts["implausible_positions"] == 0
     assert counts["retries"] <= counts["timeouts"], "nothing was sent again but what this machine was too slow for"
-    assert (f"to take it off: ibrobot feetech torque off {bench.emulator.port}" in err) == torque
+    assert (f"to take it off: `ibrobot feetech torque off {bench.emulator.port}`" in err) == torque
 
 
 def test_a_leader_that_is_missing_ends_the_start_and_leaves_no_torque_on(bench: Bench) -> None:

@@ -133,7 +133,7 @@ def test_what_holds_torque_after_a_run_is_in_its_summary(runs: Runs):
     runtime = runs.start()
     runtime.stop()
 
-    assert runtime.summary()["holding"] == ["the scene holds torque; to take it off: scene torque off"]
+    assert runtime.summary()["holding"] == ["the scene holds torque; to take it off: `scene torque off`"]
 
 
 def test_a_missing_model_is_reported_before_anything_is_powered(runs: Runs, monkeypatch: pytest.MonkeyPatch):

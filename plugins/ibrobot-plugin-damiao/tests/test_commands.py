@@ -109,7 +109,9 @@ def test_preflight_names_what_holds_torque(adapter: SlcanServer, tmp_path: Path)
         timeout=120,
         check=False,
     )
-    assert f"{adapter.channel} holds torque; to take it off: ibrobot damiao off {adapter.channel} --id 1" in done.stderr
+    assert (
+        f"{adapter.channel} holds torque; to take it off: `ibrobot damiao off {adapter.channel} --id 1" in done.stderr
+    )
     assert done.returncode == 0
 
 

@@ -143,7 +143,7 @@ def _recorded(summary: EpisodeSummary, changes: tuple[str, ...], *, sim: bool) -
     """The robot of a recorded episode, with the mode of the replay added."""
     text = summary.metadata.get("config")
     if text is None:
-        raise RecorderError(f"{summary.path}: has no robot YAML; name one: ibrobot replay {summary.path} CONFIG")
+        raise RecorderError(f"{summary.path}: has no robot YAML; name one: `ibrobot replay {summary.path} CONFIG`")
     try:
         document = json.loads(text)
     except ValueError as error:

@@ -202,7 +202,7 @@ def _errors_of(each: Summary) -> str:
 
 SUMMARY_HEAD = (
     "policy", "successes", "rate", f"{LEVEL} interval (exact)", "Wilson's interval", "median time to success",
-    "interventions per episode", "episodes with faults", "episodes with errors",
+    "safety interventions per episode", "episodes with faults", "episodes with errors",
 )  # fmt: skip
 COMPARISON_HEAD = (
     "policies", "only the first", "only the second", "difference", f"{LEVEL} interval", "p",

@@ -35,11 +35,11 @@ from ibrobot_feetech.errors import FeetechError, NoReply, Place, PortError, Serv
 from ibrobot_feetech.health import Health, Measured, SteadyLoad
 from ibrobot_feetech.opening import open_port
 from ibrobot_feetech.options import TOOL, FollowerOptions
-from ibrobot_feetech.port import emulate
+from ibrobot_feetech.port import emulate, is_device
 from ibrobot_feetech.protocol import OVER_CURRENT, OVERLOAD, faults
 from ibrobot_feetech.supply import supply
 from ibrobot_feetech.sync import Replies, SyncReader, SyncWriter
-from ibrobot_feetech.usb import BY_SERIAL, check_adapter
+from ibrobot_feetech.usb import check_adapter
 
 _RADIANS_PER_TICK = 2 * np.pi / 4096
 _SLACK_TICKS = 16
@@ -80,11 +80,10 @@ class FeetechFollower(Hardware):
         try:
             calibration = load_calibration(options.calibration, ctx.joints, tool=TOOL, device=options.port)
         except IbrobotError as error:
-            if options.port.startswith(("/dev/", BY_SERIAL)) or calibration_path(options.calibration).exists():
+            if is_device(options.port) or calibration_path(options.calibration).exists():
                 raise
             known = "its emulator has no calibration" if Path(options.port).exists() else "there is no such port"
-            command = emulate(options.port, options.calibration)
-            raise HardwareError(f"{options.port}: {known}; for an emulated arm run {command}") from error
+            raise self._not_emulated(known) from error
         closed = {joint: float(lower[joint]) for joint in options.anchored if joint in lower}
         self._arm = Arm(ctx.joints, calibration, closed)
         self._bus = FeetechBus(
@@ -110,11 +109,21 @@ class FeetechFollower(Hardware):
         """Whether the last reset failed, which may have left servos without torque."""
         self._limits = ctx.robot.lower[order], ctx.robot.upper[order]
 
+    def _not_emulated(self, known: str) -> HardwareError:
+        """The error of an emulated arm whose emulator does not run."""
+        command = emulate(self._options.port, self._options.calibration, self._ctx.source)
+        return HardwareError(f"{self._options.port}: {known}; for an emulated arm run {command}")
+
     @override
     def connect(self) -> None:
         bus, arm = self._bus, self._arm
         self._fault = HardwareError(f"{self._ctx.name}: not connected")
-        open_port(bus, arm.calibration)
+        try:
+            open_port(bus, arm.calibration)
+        except PortError as error:
+            if is_device(bus.port.path) or Path(bus.port.path).exists():
+                raise
+            raise self._not_emulated("there is no such port") from error
         bus.return_delay_s = RETURN_DELAY_S
         self._relaxed = False
         try:

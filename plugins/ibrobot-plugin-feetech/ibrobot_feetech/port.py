@@ -6,6 +6,7 @@ import errno
 import fcntl
 import os
 import select
+import shlex
 import termios
 import time
 from contextlib import suppress
@@ -27,17 +28,28 @@ _MOST_AWAITED = 255
 """Maximum number of bytes for which the kernel can delay waking a reader."""
 
 
+def is_device(path: str) -> bool:
+    """Whether a port is that of an adapter; one outside /dev is that of an emulator."""
+    return path.startswith(("/dev/", BY_SERIAL))
+
+
 def no_such_port(path: str) -> str:
-    """What to say of a port that does not exist; one outside /dev is that of an emulator."""
+    """What to say of a port that does not exist."""
     known = "there is no such port"
-    return known if path.startswith(("/dev/", BY_SERIAL)) else f"{known}; for an emulated arm run {emulate(path)}"
+    return known if is_device(path) else f"{known}; for an emulated arm run {emulate(path)}, its calibration as NAME"
 
 
-def emulate(path: str, calibration: str | None = None) -> str:
-    """The command that emulates an arm at a port, for messages."""
-    command = f"`ibrobot feetech emulate --physics CONFIG --link {path} --calibration {calibration or 'NAME'}`"
-    of_robot = "" if calibration else ", its calibration as NAME"
-    return f"{command} in another terminal, with the robot YAML as CONFIG{of_robot}"
+def emulate(path: str, calibration: str = "NAME", physics: str = "") -> str:
+    """The command that emulates an arm at a port, for messages.
+
+    Args:
+        path: the port.
+        calibration: name of the arm's calibration.
+        physics: the robot YAML whose simulation moves the joints; empty: the servos alone do.
+    """
+    moved = f"--physics {shlex.quote(physics)} " if physics else ""
+    command = f"ibrobot feetech emulate {moved}--link {shlex.quote(path)} --calibration {shlex.quote(calibration)}"
+    return f"`{command}` in another terminal"
 
 
 class SerialPort:

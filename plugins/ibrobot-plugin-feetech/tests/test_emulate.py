@@ -5,12 +5,16 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from ibrobot_calibration import load_calibration
 from ibrobot_feetech import bus as bus_module
 from ibrobot_feetech.bus import FeetechBus
+from ibrobot_feetech.commands.emulate import Hand
+from ibrobot_feetech.emulator import Emulator
+from ibrobot_feetech.ticks import MIDDLE_TICK, TICKS_PER_RADIAN
 from ibrobot_testing import ibrobot_command
 
 
@@ -59,3 +63,35 @@ def test_a_file_in_the_links_place_is_left_alone(tmp_path: Path) -> None:
     assert ran.returncode == 2
     assert f"{file} exists already and is not a link" in ran.stderr
     assert file.read_text() == "mine"
+
+
+def test_a_hand_swings_the_joints_that_have_no_torque() -> None:
+    with Emulator(3) as arm:
+        hand = Hand(arm, 0.3)
+
+        def moved(steps: int) -> list[list[float]]:
+            seen: list[list[float]] = [[servo.encoder for servo in arm.servos.values()]]
+            for _ in range(steps):
+                hand.move(0.02)
+                seen.append([servo.encoder for servo in arm.servos.values()])
+            return [[(tick - MIDDLE_TICK) / TICKS_PER_RADIAN for tick in joint] for joint in zip(*seen, strict=True)]
+
+        for joint in moved(400):
+            assert max(joint) == pytest.approx(0.3, abs=0.01)
+            assert min(joint) == pytest.approx(-0.3, abs=0.01)
+            assert max(abs(b - a) for a, b in pairwise(joint)) <= 0.02 + 1e-9, "no faster than 1 rad/s"
+        arm.servos[2].set("torque_enable", 1)
+        free, held, _ = moved(100)
+        assert max(free) - min(free) > 0.1
+        assert max(held) == min(held)
+        arm.servos[2].set("torque_enable", 0)
+        _, again, _ = moved(400)
+        assert max(again) - min(again) == pytest.approx(0.6, abs=0.02)
+
+
+@pytest.mark.parametrize("other", [("--physics", "so101_emulated"), ("--mechanics",)])
+def test_nothing_else_moves_what_a_hand_does(other: tuple[str, ...]) -> None:
+    command = (*ibrobot_command(), "feetech", "emulate", *other, "--swing", "0.3")
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert ran.returncode == 2
+    assert "--swing excludes --physics and --mechanics" in ran.stderr

@@ -204,15 +204,27 @@ class TestSetUp:
         with pytest.raises(CalibrationError, match="has no joint 'gripper'"), rig_of(file):
             pass
 
-    def test_without_an_emulator_the_error_names_its_command(self, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("source", ["", "my arms/desk.yaml"])
+    def test_without_an_emulator_the_error_names_its_command(self, tmp_path: Path, source: str) -> None:
         options = FollowerOptions(port=str(tmp_path / "arm"), calibration=str(tmp_path / "none.json"))
-        ends = f"--link {options.port} --calibration {options.calibration}` in another terminal"
-        command = f"run `ibrobot feetech emulate --physics CONFIG {ends}"
+        physics = "--physics 'my arms/desk.yaml' " if source else ""
+        arguments = f"{physics}--link {options.port} --calibration {options.calibration}"
+        command = f"run `ibrobot feetech emulate {arguments}` in another terminal"
+        ctx = control_context(source=source)
         for known in ("there is no such port", "its emulator has no calibration"):
             with pytest.raises(HardwareError, match=re.escape(command)) as error:
-                FeetechFollower(options, control_context())
+                FeetechFollower(options, ctx)
             assert known in str(error.value)
             Path(options.port).touch()
+
+    def test_an_emulator_that_ended_is_named_with_its_command(self, calibration_file: Path, tmp_path: Path) -> None:
+        options = FollowerOptions(port=str(tmp_path / "arm"), calibration=str(calibration_file))
+        follower = FeetechFollower(options, control_context())
+        command = f"run `ibrobot feetech emulate --link {options.port} --calibration {calibration_file}` in another"
+        with pytest.raises(
+            HardwareError, match=re.escape(f"{options.port}: there is no such port; for an emulated arm {command}")
+        ):
+            follower.connect()
 
     def test_no_port_says_what_to_do(self, calibration_file: Path) -> None:
         options = FollowerOptions(port="/dev/ttyNONE", calibration=str(calibration_file))

@@ -90,10 +90,10 @@ class ImportConfig:
         if note:
             echo(f"note: {note}")
         if converted.alone:
-            echo(f"use it: ibrobot convert BAG --config {target} --out DATASET")
-            echo(f"not for ibrobot launch: {_missing(target)}. {_TO_LAUNCH}")
+            echo(f"use it: `ibrobot convert BAG --config {target} --out DATASET`")
+            echo(f"not for `ibrobot launch`: {_missing(target)}. {_TO_LAUNCH}")
         else:
-            echo(f"try it: ibrobot launch {target} --sim --mode web --web")
+            echo(f"try it: `ibrobot launch {target} --sim --mode web --web`")
 
 
 def convert_file(path: Path, *, contract: bool = False) -> Imported:
@@ -192,7 +192,7 @@ def _check(converted: Imported, draft: Path, source: Path, out: Path) -> str:
     except ConfigError as error:
         if packages := _lacking(converted):
             at_out = ConfigError(attrs.evolve(each, file=str(out)) for each in error.problems)
-            return f"{at_out}; not all could be checked: {install_command(packages)}, then ibrobot config check {out}"
+            return f"{at_out}; not all could be checked: {install_command(packages)}, then `ibrobot config check {out}`"
         raise ConfigError(_at_the_source(each, converted.draft, source) for each in error.problems) from None
     return ""
 

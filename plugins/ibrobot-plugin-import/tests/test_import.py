@@ -131,7 +131,7 @@ def test_what_a_contract_alone_lacks_for_a_launch_is_printed(tmp_path: Path) -> 
     assert done.exit_code == 0, done.output
     assert "12 values taken, 0 changed, 7 without a counterpart" in done.output
     lacks = "it has no robot, executors, control_modes, default_control_mode, hardware"
-    assert f"not for ibrobot launch: {lacks}. To launch such a robot, copy its observations" in done.output
+    assert f"not for `ibrobot launch`: {lacks}. To launch such a robot, copy its observations" in done.output
     assert "# A contract alone, for `ibrobot convert --config`." in (tmp_path / "new.yaml").read_text()
 
 

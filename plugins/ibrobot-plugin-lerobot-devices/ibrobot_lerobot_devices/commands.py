@@ -83,7 +83,7 @@ class NewRobot:
             echo(f"note: limits of joints are guesses, since LeRobot has no calibration {name}: check them")
         if written.unknown_leader:
             echo(f"note: the file has no leader: {written.unknown_leader}")
-        echo(f"try it: ibrobot launch {self.out}")
+        echo(f"try it: `ibrobot launch {self.out}`")
 
 
 @attrs.frozen(kw_only=True)

@@ -59,7 +59,7 @@ def test_the_command_that_undoes_a_change_is_the_one_that_it_prints(tmp_path, ep
     episode = folder / episode.relative_to(tmp_path / "pick")
     before = {name: content for name, content in files(episode).items() if name.endswith(".mcap")}
     command, *arguments = change
-    (undo,) = re.findall(r"^to undo: ibrobot episodes (.*)$", run(command, episode, *arguments), re.MULTILINE)
+    (undo,) = re.findall(r"^to undo: `ibrobot episodes (.*)`$", run(command, episode, *arguments), re.MULTILINE)
     assert {name: files(tmp_path).get(str(episode.relative_to(tmp_path) / name)) for name in before} != before
     assert "restored" in run(*shlex.split(undo))
     assert {name: files(episode)[name] for name in before} == before

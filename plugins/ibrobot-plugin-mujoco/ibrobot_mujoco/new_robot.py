@@ -97,7 +97,7 @@ class NewRobot:
             echo(f"note: {note}")
         for doubt in model.doubts:
             echo(f"check: {doubt}")
-        echo(f"try it: ibrobot launch {self.out} --sim --mode web --web")
+        echo(f"try it: `ibrobot launch {self.out} --sim --mode web --web`")
         echo(f"{_LOW}. Before you raise them for a real arm, read its datasheet.")
 
 

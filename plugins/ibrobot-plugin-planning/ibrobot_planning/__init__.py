@@ -142,6 +142,7 @@ def ibrobot_sections() -> Iterable[SectionDescriptor]:
         type="guard_feed",
         make=lambda options, session: Late(_feed(session.config))(session),
         without_section=lambda config: config.robot.description.mjcf is not None or config.control.guard is not None,
+        check=find_engines,
         check_config=Late("ibrobot_planning.guard.check:faults"),
         summary="says at the start what commands are guarded against, and tells the guard of changes of the world; runs"
         " by itself for robots with an MJCF or a guard",

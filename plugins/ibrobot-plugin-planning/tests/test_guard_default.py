@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_planning.guard import notice as notices
 from ibrobot_planning.guard import unsaid as unsaids
 from ibrobot_planning.guard.unsaid import unsaid
+from ibrobot_testing.command import command_line
 
 from ibrobot_core.api import MissingDependency, String
 from ibrobot_core.app import ComponentFailed, ConfigError, RobotConfig
@@ -110,6 +113,28 @@ class TestRun:
         config, line = said(make, caplog, FLOOR, "default_control_mode=idle", text=text)
         assert config.control.guard is None
         assert line.endswith("needs coal; pip install coal")
+
+
+@pytest.mark.parametrize("extra", ["", "world: {}\n"], ids=["guard", "world"])
+def test_config_check_says_what_system_library_a_run_will_lack(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, extra: str
+) -> None:
+    def load(name: str) -> None:
+        raise OSError(f"{name}: cannot open shared object file")
+
+    robot = tmp_path / "robot.yaml"
+    robot.write_text(robot_yaml(tmp_path) + extra)
+    check, arguments = command_line("config"), ["check", str(robot), "--set", FLOOR]
+    assert "libgomp" not in CliRunner().invoke(check, arguments).output
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setattr("ctypes.CDLL", load)
+    checked = CliRunner().invoke(check, arguments)
+    assert checked.exit_code == 0
+    assert [line for line in checked.output.splitlines() if "libgomp" in line] == [
+        "note: planning around obstacles needs the system library libgomp.so.1, and so does the guard; "
+        "sudo apt-get install libgomp1"
+    ]
+    assert json.loads(CliRunner().invoke(check, [*arguments, "--json"]).output) == [], "the file has no fault"
 
 
 def test_a_region_with_a_link_that_is_not_there_is_refused(make: Make, tmp_path: Path) -> None:

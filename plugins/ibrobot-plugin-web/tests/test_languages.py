@@ -47,6 +47,14 @@ SHOWN = """[...document.querySelectorAll('#nav, #main')].flatMap((part) => {
 })"""
 """The visible texts of the page of `ibrobot ui`, without output and values."""
 
+TITLE = """async (title) => {
+  const { JobCard } = await import("/static/ui/job.js");
+  const card = new JobCard({ session: { views: [] }, drives: true });
+  card.update({ number: 1, title, kind: "convert", state: "done", facts: {}, lines: [] });
+  return card.title.textContent;
+}"""
+"""What the card of a job with a title shows as its title."""
+
 
 @pytest.mark.integration
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
@@ -72,5 +80,10 @@ def test_no_english_sentence_is_left_in_a_chinese_browser(tmp_path: Path) -> Non
                 continue  # what is missing for it, in the words of its package
             english = re.compile(r"[^\u4e00-\u9fff]*[A-Za-z]+ [a-z]+ [a-z]+[^\u4e00-\u9fff]*")
             assert [text for text in page.evaluate(SHOWN) if english.fullmatch(text)] == [], view
+        for title, shown in (
+            ("Convert picks/a", "转换 picks/a"),
+            ("Explain b", "分析失败 b"),
+        ):
+            assert page.evaluate(TITLE, title) == shown
         browser.close()
     assert errors == []

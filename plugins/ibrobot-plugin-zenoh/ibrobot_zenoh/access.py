@@ -69,7 +69,7 @@ def _by_certificate(tls: Tls, own: Identity) -> Peers:
     if own.role is not Role.SERVER:
         raise TransportError(
             f"{tls.certificate}: is the certificate of robot {own.name}, which may only connect; to listen, give the "
-            "certificate of a server: ibrobot certs FOLDER --server HOST"
+            "certificate of a server: `ibrobot certs FOLDER --server HOST`"
         )
     if tls.robots is None:
         raise TransportError(

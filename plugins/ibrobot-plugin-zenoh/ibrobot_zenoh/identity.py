@@ -75,7 +75,7 @@ def identity_in(certificate: Path) -> Identity:
     if len(names) != 1 or len(roles) != 1 or roles[0].value not in {role.value for role in Role}:
         raise TransportError(
             f"{certificate}: has no role (server or robot), so the permissions of its machine are unknown; replace the "
-            "certificates of all machines by new ones: ibrobot certs NEW_FOLDER --server HOST --robot NAME"
+            "certificates of all machines by new ones: `ibrobot certs NEW_FOLDER --server HOST --robot NAME`"
         )
     return Identity(str(names[0].value), Role(roles[0].value))
 

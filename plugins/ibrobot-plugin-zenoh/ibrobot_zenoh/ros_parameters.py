@@ -145,7 +145,7 @@ class RosParameters(Component):
         if name == MODE:
             reason = f"{SET_MODE.name} is not shared; transport.share.services of the robot lists what is"
         elif name in self._values:
-            reason = f"is read when a run starts: ibrobot launch … --set {name}=…"
+            reason = f"is read when a run starts: `ibrobot launch … --set {name}=…`"
         else:
             reason = "there is no such parameter"
         return {"successful": False, "reason": reason}

@@ -147,7 +147,7 @@ def test_only_the_mode_can_be_set(robot: tuple[Any, Ask]):
     assert session.mode == "teleop"
     for name, value, reason in (
         ("mode", "dance", "no such mode"),
-        ("control.rate_hz", "5", "is read when a run starts: ibrobot launch … --set control.rate_hz=…"),
+        ("control.rate_hz", "5", "is read when a run starts: `ibrobot launch … --set control.rate_hz=…`"),
         ("x", "5", "there is no such parameter"),
     ):
         assert set_(name, value) == {"successful": False, "reason": reason}

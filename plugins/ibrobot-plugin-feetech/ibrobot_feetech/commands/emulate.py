@@ -34,6 +34,10 @@ _CHANCES = ("drop", "corrupt", "duplicate", "late", "late_s", "delay_s")
 """The options that are attributes of the emulator's faults."""
 _PRIORITY = 70
 """Real-time priority, above that of a control process, which waits for the servos."""
+_STEP_S = 0.02
+"""Period of looking at the emulated arm, and of moving it by hand [s]."""
+_SWING_S, _HAND = 8.0, 1.0
+"""Time of a swing to and fro [s], and the highest speed of a hand [rad/s]."""
 _SWITCH_S = 2e-4
 """Longest time for which the physics may delay the servos' answers [s]."""
 
@@ -72,6 +76,9 @@ class Emulate:
     cables: tuple[tuple[int, int], ...] = option(
         (), typed="--cable ID TICKS", help="with --mechanics, a cable that pulls a joint back from so many ticks on"
     )
+    swing: float = option(
+        0.0, ge=0, le=0.5, unit="rad", help="how far a hand swings each joint without torque to and fro, as a leader's"
+    )
     errors: tuple[tuple[int, int], ...] = option((), typed="--error ID BITS", help="error bits of a servo")
 
     def __call__(self) -> None:
@@ -85,6 +92,8 @@ class Emulate:
             )
         if self.mechanics and self.physics is not None:
             raise RequestError("--mechanics and --physics exclude each other: either moves the joints")
+        if self.swing and (self.physics is not None or self.mechanics):
+            raise RequestError("--swing excludes --physics and --mechanics: something else moves the joints there")
         ended = threading.Event()
         on_signals(ended.set)
         config = _config(self.physics) if self.physics is not None else None
@@ -116,7 +125,8 @@ class Emulate:
                 stack.callback(arm.stop)
             _hurry()
             echo(f"{count} servos at {self.baud} baud; Ctrl-C ends it", err=True)
-            _wait(ended, arm)
+            hand = Hand(emulator, self.swing) if self.swing else None
+            _wait(ended, arm, hand)
 
 
 def _add_mechanics(emulator: Emulator, joints: Sequence[str], cables: Mapping[int, int]) -> None:
@@ -140,9 +150,35 @@ def _hurry() -> None:
         echo(refused, err=True)
 
 
-def _wait(ended: threading.Event, arm: PhysicsArm | None) -> None:
+class Hand:
+    """A hand that swings the joints of an emulated arm to and fro about their middle, those without torque.
+
+    Args:
+        emulator: the arm.
+        amplitude: how far to each side [rad].
+    """
+
+    def __init__(self, emulator: Emulator, amplitude: float) -> None:
+        self._emulator = emulator
+        self._amplitude = amplitude * TICKS_PER_RADIAN
+        self._angle = 0.0
+
+    def move(self, elapsed_s: float) -> None:
+        """Move each joint towards where the hand wants it after `elapsed_s` [s], no faster than a hand."""
+        self._angle += 2 * math.pi * elapsed_s / _SWING_S
+        farthest = _HAND * TICKS_PER_RADIAN * elapsed_s
+        with self._emulator.lock:
+            for number, servo in self._emulator.servos.items():
+                wanted = MIDDLE_TICK + self._amplitude * math.sin(self._angle - number)  # one joint after the other
+                if not servo.torque:
+                    servo.turn(servo.encoder + max(-farthest, min(farthest, wanted - servo.encoder)))
+
+
+def _wait(ended: threading.Event, arm: PhysicsArm | None, hand: Hand | None) -> None:
     announced = False
-    while not ended.wait(0.05):
+    while not ended.wait(_STEP_S):
+        if hand is not None:
+            hand.move(_STEP_S)
         if arm is not None:
             if arm.error is not None:
                 return

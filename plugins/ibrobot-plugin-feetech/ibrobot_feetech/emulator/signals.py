@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import select
+import shlex
 import socket
 from collections.abc import Sequence
 from contextlib import suppress
@@ -80,6 +81,8 @@ class EmulatedSignal(Sensor):
         self.topic = options.signal
         self._path = options.socket
         self._name = ctx.name
+        robot, port = shlex.quote(ctx.source or "CONFIG"), shlex.quote(options.socket.removesuffix(".signals"))
+        self._remedy = f"start `ibrobot feetech emulate --physics {robot} --link {port}`, which makes it"
         self._socket: socket.socket | None = None
 
     @override
@@ -90,8 +93,7 @@ class EmulatedSignal(Sensor):
             connection.send(self.topic.encode())
         except OSError as error:
             connection.close()
-            remedy = "start `ibrobot feetech emulate --physics CONFIG`, which prints it"
-            raise SensorError(f"{self._name}: {self._path}: {error.strerror}; {remedy}") from None
+            raise SensorError(f"{self._name}: {self._path}: {error.strerror}; {self._remedy}") from None
         self._socket = connection
 
     @override

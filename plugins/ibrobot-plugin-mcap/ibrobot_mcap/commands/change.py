@@ -218,7 +218,7 @@ def _description(summary: EpisodeSummary) -> str:
 
 
 def _say_undo(folder: Path, number: str) -> None:
-    echo(f"to undo: ibrobot episodes trash {shlex.quote(str(folder))} --restore {number}", err=True)
+    echo(f"to undo: `ibrobot episodes trash {shlex.quote(str(folder))} --restore {number}`", err=True)
 
 
 def _report(emit: Emit, change: Changed) -> None:

@@ -35,4 +35,4 @@ class DraftContract:
                 file.write(text)
         except OSError as error:
             raise RecorderError(f"{self.output}: cannot be written: {error.strerror}") from error
-        echo(f"{self.output}: read it, then ibrobot convert {self.bag} --config {self.output} --out DATASET")
+        echo(f"{self.output}: read it, then `ibrobot convert {self.bag} --config {self.output} --out DATASET`")

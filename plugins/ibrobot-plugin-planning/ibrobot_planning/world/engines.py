@@ -25,5 +25,5 @@ def find_engines() -> None:
         try:
             ctypes.CDLL("libgomp.so.1")  # Pinocchio's wheel does not bring it
         except OSError:
-            message = "planning around obstacles needs the system library libgomp.so.1"
+            message = "planning around obstacles needs the system library libgomp.so.1, and so does the guard"
             raise MissingDependency(message, apt=["libgomp1"]) from None

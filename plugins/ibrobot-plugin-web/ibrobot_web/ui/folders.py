@@ -55,7 +55,7 @@ class Folders:
         path = (self.first / text).resolve()
         if not any(path.is_relative_to(folder) for folder in self.paths):
             opened = ", ".join(map(str, self.paths))
-            raise IbrobotError(f"{text} is outside the opened folders ({opened}); open its folder: ibrobot ui FOLDER")
+            raise IbrobotError(f"{text} is outside the opened folders ({opened}); open its folder: `ibrobot ui FOLDER`")
         return path
 
     def has(self, path: Path) -> bool:

@@ -15,13 +15,11 @@ from ibrobot_core.api import IbrobotError, option
 from ibrobot_core.app import (
     ConfigError,
     RobotConfig,
-    absent_sensors,
-    describe_absent,
     find_config,
     installed_plugins,
     load_config,
+    notes_of,
     shipped_configs,
-    unavailable_modes,
 )
 from ibrobot_web.modes import modes_json
 from ibrobot_web.ui.context import Routes, Ui
@@ -94,9 +92,7 @@ def check(ui: Ui, robot: str, sim: bool = False) -> dict[str, Any]:
             return {"problems": [_problem(ui, each) for each in error.problems]}
         except IbrobotError as error:
             return {"problems": [{"file": named, "line": 0, "path": "", "message": str(error)}]}
-        notes = unavailable_modes(config.unavailable)
-        if absent := describe_absent(absent_sensors(config, registry)):
-            notes.append(f"runs start without {absent}")
+        notes = notes_of(config, registry)
     return {"problems": [], "notes": notes, **_facts(config)}
 
 

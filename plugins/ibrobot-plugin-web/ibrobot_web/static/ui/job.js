@@ -10,6 +10,12 @@ const MADE = { dataset: ["datasets", "Open the dataset"], policy: ["policies", "
 export const RUNS = ["run", "record"];
 const STATES = { running: "running", done: "done", failed: "failed", cancelled: "ended" };
 
+// The title of a job begins with what the page calls its command; then it names files.
+function titled(title) {
+  const shown = words(title);
+  return shown === title ? title.replace(/^\S+/, (name) => words(name)) : shown;
+}
+
 export class JobCard {
   constructor(ui) {
     this.ui = ui;
@@ -31,7 +37,7 @@ export class JobCard {
   }
 
   update(job) {
-    say(this.title, job.title);
+    say(this.title, titled(job.title));
     say(this.state, job.cancelling && job.state === "running" ? "ending …" : STATES[job.state]);
     this.state.className = `state ${job.state}`;
     const { progress } = job.facts;

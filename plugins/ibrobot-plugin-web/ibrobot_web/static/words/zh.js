@@ -625,7 +625,7 @@ export default {
   "95 % interval (exact)": "95 % 区间（精确）",
   "Wilson's interval": "Wilson 区间",
   "median time to success": "成功用时中位数",
-  "interventions per episode": "每回合的安全干预",
+  "safety interventions per episode": "每回合的安全干预",
   "episodes with faults": "有故障的回合",
   "episodes with errors": "出错的回合",
   "Tall marks are failures.": "高的标记表示失败。",
