@@ -699,6 +699,23 @@ def test_an_object_that_moves_is_where_it_is_and_not_where_it_was(tmp_path) -> N
     assert loop.guard.counts["ticks"] == 0 or loop.guard.overruled == ""
 
 
+@pytest.mark.parametrize("trembles_m", [5e-4, 1e-7])
+def test_an_object_that_trembles_is_not_come_nearer_to(tmp_path, trembles_m: float) -> None:
+    """As one that a camera tracks: what is allowed for rounding is allowed once, not at every motion."""
+    seen, clear, inside = Seen(WALL), LEFT, (LEFT + ACROSS) / 2
+    for _ in range(30):
+        at = (clear + inside) / 2
+        clear, inside = (at, inside) if seen.distance(at) > 0.0015 else (clear, at)
+    loop, rng = Loop(tmp_path, clear), np.random.default_rng(3)
+    loop.world(WALL)
+    wall = WALL["wall"].pose.position
+    for _ in range(400):
+        pose = Pose(Vector3(wall.x, wall.y + rng.uniform(-trembles_m, trembles_m), wall.z))
+        loop.guard.world(WorldChange({}, moved={"wall": pose}).message())
+        loop.tick(ACROSS)
+    assert seen.distance(loop.position) > 0.001
+
+
 class TestFeed:
     """What tells the guard of the world: each change once, and in its words."""
 

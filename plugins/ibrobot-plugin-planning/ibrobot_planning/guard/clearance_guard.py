@@ -236,8 +236,9 @@ class ClearanceGuard(Guard):
         if finished.pairs is not None:
             finished.pairs.take_over(self._pairs)
             self._pairs = finished.pairs
-        for name, pose in finished.moved:
-            self._pairs.move(name, pinocchio.SE3(matrix(pose)), self._begin)
+        if finished.moved:
+            placements = {name: pinocchio.SE3(matrix(pose)) for name, pose in finished.moved}
+            self._pairs.move(placements, self._begin)
 
     def _made(self, world: World, before: Pairs | None) -> Pairs:
         """The pairs of a world with what may be touched; also called in another thread."""

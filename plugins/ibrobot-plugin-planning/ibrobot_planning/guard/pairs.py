@@ -130,15 +130,27 @@ class Pairs:
         for part in self.parts:
             part.objects.update((name, thing) for name, thing in objects.items() if name in part.objects)
 
-    def move(self, name: str, placement: Any, q: Vector) -> None:
-        """Move an object that stands in the base frame to `placement`, a pinocchio.SE3, while the joints are at `q`."""
+    def move(self, placements: Mapping[str, Any], q: Vector) -> None:
+        """Move objects that stand in the base frame, each to a pinocchio.SE3, while the joints are at `q`.
+
+        The limit of a pair that is near moves along: an object that trembles does not let the arm come nearer by
+        what is allowed for rounding, each time anew.
+        """
         self._set(q)
         for number, (part, at) in enumerate(zip(self.parts, self._slices, strict=True)):
-            if name in part.objects:
-                pairs = part.move(name, placement)
-                self._room[number] = -math.inf
-                self._known[pairs + at.start], self._at[pairs + at.start] = part.apart(self._data)[pairs], q
-                self.limits[pairs + at.start] = self.margins[pairs + at.start]
+            here = {name: placement for name, placement in placements.items() if name in part.objects}
+            if not here:
+                continue
+            pairs = part.of(here) + at.start
+            margins, moved = self.margins[pairs], np.abs(q - self._at[pairs])
+            near = self._known[pairs] - np.einsum("pj,pj->p", moved, self.levers[pairs]) < margins
+            before = self.distances(q, pairs[near])
+            part.move(here)
+            self._room[number] = -math.inf
+            self._known[pairs], self._at[pairs] = part.apart(self._data)[pairs - at.start], q
+            limits = margins.copy()
+            limits[near] = np.minimum(margins[near], self.limits[pairs[near]] + self.distances(q, pairs[near]) - before)
+            self.limits[pairs] = limits
 
     def estimate(self, q: Vector, other: Pairs | None = None) -> None:
         """Take as distances those of bounding spheres at `q`, shape (J,), and measure those that are near.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import batched, product
 from typing import Any, Self
 
@@ -137,13 +137,17 @@ class Part:
         between: Vector = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) - self._spheres[self.ends].sum(axis=1)
         return between
 
-    def move(self, name: str, placement: Any) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-        """Have an object at `placement`, a pinocchio.SE3; returns its pairs."""
-        numbers = self._numbers[name]
-        for number in numbers:
-            within = pinocchio.SE3(self._within[number - self._first])
-            self.geometry.geometryObjects[number].placement = placement * within
+    def of(self, names: Iterable[str]) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+        """The pairs of some objects."""
+        numbers = [number for name in names for number in self._numbers[name]]
         return np.flatnonzero(np.isin(self.ends, numbers).any(axis=1))
+
+    def move(self, placements: Mapping[str, Any]) -> None:
+        """Have objects at placements, each a pinocchio.SE3."""
+        for name, placement in placements.items():
+            for number in self._numbers[name]:
+                within = pinocchio.SE3(self._within[number - self._first])
+                self.geometry.geometryObjects[number].placement = placement * within
 
 
 def parts(moving: Moving, standing: Mapping[str, WorldObject], before: Sequence[Part]) -> Iterator[Part]:
