@@ -110,6 +110,8 @@ class JointCalibration:
 
 _NUMBERS = tuple(field.name for field in attrs.fields(JointCalibration) if field.name not in ("zero_at", "closed_at"))
 _KEYS = ", ".join(_NUMBERS)
+_NUMBER = re.compile("[0-9]{1,3}")
+"""Key of a servo in IB-Robot's file."""
 
 
 @attrs.frozen
@@ -222,7 +224,7 @@ def load_calibration(
     text, document = _document(path, tool, device)
     if not isinstance(document, dict) or not document:
         raise CalibrationError(f"{path}: must be an object of joints, each with {_KEYS}")
-    numbered = all(key.isdigit() for key in document)
+    numbered = all(_NUMBER.fullmatch(key) for key in document)
     if numbered:
         document = _by_name(document, path, joints)
     joints_read = {}
@@ -230,7 +232,8 @@ def load_calibration(
         try:
             joints_read[joint] = _joint(numbers)
         except ValueError as error:
-            line = _line(text, joint if f'"{joint}"' in text else str(numbers.get("id")), str(error).partition(":")[0])
+            servo = numbers.get("id") if isinstance(numbers, dict) else None
+            line = _line(text, joint if f'"{joint}"' in text else str(servo), str(error).partition(":")[0])
             raise CalibrationError(f"{path}:{line}: {joint}: {error}") from None
     if joints is not None and (missing := [joint for joint in joints if joint not in joints_read]):
         raise CalibrationError(f"{path}: has no joint {missing[0]!r}; it has: {', '.join(joints_read)}")
@@ -257,7 +260,7 @@ def _document(path: Path, tool: str | None = None, device: str = "") -> tuple[st
         raise CalibrationError(f"{path}: there is no such calibration; {remedy}") from None
     except json.JSONDecodeError as error:
         raise CalibrationError(f"{path}:{error.lineno}: not JSON: {error.msg}") from None
-    except (OSError, UnicodeDecodeError, ValueError) as error:
+    except (OSError, RecursionError, UnicodeDecodeError, ValueError) as error:
         raise CalibrationError(f"{path}: cannot be read: {error}") from None
 
 

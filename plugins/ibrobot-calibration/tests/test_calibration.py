@@ -59,6 +59,10 @@ def test_what_cannot_be_true_is_refused_by_name(tmp_path: Path, change: dict[str
         ('{"pan": {"id": 1}}', "pan: drive_mode: is missing"),
         (json.dumps({"a": GOOD, "b": GOOD}), "b: id: servo 1 belongs to a already"),
         ('{"pan": {}, "pan": {}}', "'pan' is there twice"),
+        ('{"\\u0070an": 5}', "pan: must be an object with id, drive_mode"),
+        ('{"\u00b2": 5}', "\u00b2: must be an object with id, drive_mode"),
+        (f'{{"{"9" * 5000}": 5}}', "must be an object with id, drive_mode"),
+        ("[" * 200_000, "cannot be read: maximum recursion depth"),
     ],
 )
 def test_files_that_are_none_are_refused(tmp_path: Path, text: str, message: str) -> None:
