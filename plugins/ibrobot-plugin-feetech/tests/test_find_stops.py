@@ -220,7 +220,7 @@ def test_person_says_which_way_joints_turn(rig):
 
 def test_friction_that_holds_the_joint_is_refused(rig):
     rig.mechanics(1).sticky = (2400, 2700, 0.45)
-    rig.refuses("shoulder_pan: (between both places where it stops are [0-9]+ deg|it does not come from)")
+    rig.refuses("shoulder_pan: (between both places where it stops are [0-9]+ deg|on its way to)")
 
 
 def test_friction_that_yields_to_the_whole_torque_is_no_stop(rig):
@@ -257,7 +257,7 @@ def test_servo_in_overload_is_refused(rig):
 def test_servo_that_falls_silent_stops_the_arm_and_the_others_are_restored(rig):
     before = rig.registers()
     rig.guide.at[90] = lambda: rig.emulator.faults.silent.add(1)
-    with pytest.raises(HardwareError, match=r"servo 1 .shoulder_pan.*: (it stopped answering|no reply)"):
+    with pytest.raises(HardwareError, match=r"servo 1 .shoulder_pan.*: (no valid reply for 6 readings|no reply)"):
         rig.calibrate()
     assert rig.registers()[3] == before[3]
     assert any(text.startswith("error: not restored: ") and "servo 1" in text for text in rig.guide.said)
@@ -293,7 +293,7 @@ def test_hand_that_holds_a_joint_is_refused(rig):
         rig.mechanics(3).hand = rig.emulator.servos[3].encoder
 
     rig.guide.at[60] = grip
-    rig.refuses("elbow_flex: (between both places|it does not come|it stands still)")
+    rig.refuses("elbow_flex: (between both places|on its way|it stands still)")
 
 
 def test_hand_that_moves_another_joint_is_refused(rig):
@@ -412,7 +412,7 @@ def oddity(rng: np.random.Generator, rig: Rig) -> str:
     return str(kind)
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", range(24))
 def test_odd_arm_is_measured_right_or_refused(rig, seed):
     """Siblings of the oddities above: whatever is odd, no range is wrong, and no torque above the stated one."""
     kind, before = oddity(np.random.default_rng(seed), rig), rig.registers()

@@ -54,14 +54,14 @@ _PUSHES = 0.85
 """Share of the torque above which a standing joint pushes with all of it."""
 _IDLE_S = 2.0
 """A joint that stands still for so long without pushing does not obey."""
-_ARRIVES_S, _ARRIVED = 8.0, 30
-"""Time in which a joint must come to a position, and within how many ticks of it."""
+_ARRIVED, _NEARER = 10, 5
+"""A joint is at a position within so many ticks, and on its way there if it comes nearer by so many in `_IDLE_S`."""
 _OTHERS = 170
 """How far a joint that should hold its position may move [ticks]: 15 degrees, since a soft servo sags."""
 _SETTLES_S = 1.0
 """Time in which joints settle after the torque came on."""
-_LOST_S = 0.3
-"""How long a servo may be silent."""
+_LOST = 5
+"""Readings in a row that a servo may miss."""
 _SHORT, _LONG = 0.05, 0.25
 """By which share a range may be shorter and longer than the joint's limits."""
 _MARGIN = 20
@@ -153,7 +153,7 @@ class StopFinder:
         """Servo -> the torque limit that it has."""
         self._ranges: dict[int, Range] = {}
         self._now: dict[int, _State] = {}
-        self._heard: dict[int, float] = {}
+        self._missed = dict.fromkeys(self._ids, 0)
         self._held: dict[int, int] = {}
         """Servo -> where it should be, for all that do not move."""
         self._active: int | None = None
@@ -212,7 +212,6 @@ class StopFinder:
             HardwareError: if a servo does not answer or obey, or is not well.
         """
         for servo in self._ids:
-            self._heard[servo] = self._clock()
             hold(self._bus, servo)
         self._do("The joints hold the pose. Ending this stops the arm.", self._settle())
         inverted = self._inverted
@@ -288,12 +287,13 @@ class StopFinder:
     def _look(self) -> bool:
         """Read all servos, and refuse whatever is not as it should be; returns whether all answered."""
         replies = self._reader.read()
-        now_s = self._clock()
         values, columns = replies.values, self._columns
         for row, servo in enumerate(self._ids):
+            self._missed[servo] = 0 if replies.answered[row] else self._missed[servo] + 1
+            if self._missed[servo] > _LOST:
+                raise NoReply(self._bus.place(servo), f"no valid reply for {self._missed[servo]} readings")
             if not replies.answered[row]:
                 continue
-            self._heard[servo] = now_s
             place = self._bus.place(servo)
             each = {name: int(values[row, column]) for name, column in columns.items()}
             if code := int(replies.errors[row]) | each["status"]:
@@ -313,9 +313,6 @@ class StopFinder:
             self._check(servo, state)
         if self._over >= 3:
             raise HardwareError(self._too_much)
-        for servo, heard_s in self._heard.items():
-            if now_s - heard_s > _LOST_S:
-                raise NoReply(self._bus.place(servo), f"it stopped answering {now_s - heard_s:.1f} s ago")
         return bool(replies.answered.all())
 
     def _check(self, servo: int, state: _State) -> None:
@@ -475,10 +472,10 @@ class StopFinder:
             if abs(state.speed) > _SPEED / 4:
                 self._loads[servo].append((state.position, state.load, sign))
             recent.append((now_s, state.position))
-            while now_s - recent[0][0] > _STALLED_S:
+            while len(recent) > 2 and now_s - recent[1][0] >= _STALLED_S:
                 recent.popleft()
             places = [position for _, position in recent]
-            stands = now_s - recent[0][0] > 0.8 * _STALLED_S and max(places) - min(places) <= _STALLED
+            stands = now_s - recent[0][0] >= _STALLED_S and max(places) - min(places) <= _STALLED
             if not stands:
                 moved_s = now_s
             elif abs(state.load) >= _PUSHES * self._limits[servo]:
@@ -508,16 +505,18 @@ class StopFinder:
     def _go(self, joint: Joint, goal: int) -> _Steps[None]:
         """Move to a position."""
         servo = joint.servo
-        until_s = self._clock() + _ARRIVES_S
+        nearest, until_s = abs(goal - self._now[servo].position), self._clock() + _IDLE_S
         sign = 1 if goal > self._now[servo].position else -1
         # A soft servo stops short of its goal, where the weight balances it, so the goal leads the joint.
-        while sign * (goal - self._now[servo].position) > 0 and abs(goal - self._now[servo].position) > _ARRIVED / 3:
+        while sign * (goal - self._now[servo].position) > _ARRIVED:
             state = self._now[servo]
+            if (left := abs(goal - state.position)) <= nearest - _NEARER:
+                nearest, until_s = left, self._clock() + _IDLE_S
             if abs(state.speed) > _SPEED / 4:
                 self._loads[servo].append((state.position, state.load, sign))
             if self._clock() > until_s:
                 raise CalibrationError(
-                    f"{joint.name}: it does not come from {state.position} to {goal} within {_ARRIVES_S:.0f} s with "
+                    f"{joint.name}: on its way to {goal} it stands still at {state.position} for {_IDLE_S:.0f} s with "
                     f"{100 * self._torque:.0f} % of the torque: something holds it, or its weight is more than that; "
                     "free the joint, or give more by --torque"
                 )
