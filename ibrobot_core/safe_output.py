@@ -18,8 +18,8 @@ import click
 from ibrobot_core.errors import RequestError
 from ibrobot_core.options import HIDDEN
 
-_UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-"""Control characters except tab and line feed, characters that change the text direction, and lone surrogates."""
+_UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2060-\u206f\ud800-\udfff]")
+"""Control characters except tab and line feed, those that change the text direction, and lone surrogates."""
 _CREDENTIALS = re.compile(r"(?P<scheme>\b[A-Za-z][A-Za-z0-9+.-]*://)[^\s/?#]*@")
 _PARAMETERS = re.compile(r"(?i)(?P<name>[?&](?:user(?:name)?|pass(?:word|wd)?|pwd|secret)=)[^&\s#'\"]+")
 _TYPED = "`uv run ibrobot " if "UV_RUN_RECURSION_DEPTH" in os.environ else "`ibrobot "

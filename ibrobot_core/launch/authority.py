@@ -225,8 +225,7 @@ class Authority:
             if service is not None and not (service.reads or service.urgent):
                 if service.persons:
                     raise NotSupported(f"{name} is for persons only: ask one")
-                granted = self._granted(agent, name)
-                if name not in granted.services:
+                if name not in (granted := self._granted(agent, name)).services:
                     raise HardwareError(f"{name} is not granted; granted: {', '.join(granted.services) or 'nothing'}")
                 grant, self._called[name] = granted, service
             answer = self._session.bus.call(name, request)
@@ -273,16 +272,20 @@ class Authority:
         elif why := self._left or self._outside(scope):
             self.end(f"not within the region: {why}")
 
-    def taken_over(self, what: str) -> None:
+    def taken_over(self, what: str, policy: bool = False) -> None:
         """Note that the mode is entered or reset, which ends the authority unless its agent does it.
+
+        Args:
+            what: what happens, for messages.
+            policy: whether it starts one, which also a task of an agent does only if `/set_mode` is granted.
 
         Raises:
             HardwareError: if an agent does it that may not.
         """
-        if (agent := ACTING.get()) is not None:
-            self._granted(agent, what)
-        else:
+        if (agent := ACTING.get()) is None:
             self.end(f"{what} by another")
+        elif "/set_mode" not in self._granted(agent, what).services and policy:
+            raise HardwareError(f"{what} starts a policy, and /set_mode is not granted: ask a person to grant it")
 
     def end(self, why: str, *, hold: bool = True) -> None:
         """End the authority, if there is one; the robot then holds until a person goes on, if `hold`."""

@@ -175,7 +175,8 @@ class Runtime:
             raise PluginError(f"mode {name} is unavailable: {reason}")
         if session.faults:
             raise HardwareError(f"mode {name}: refused before a reset: {session.faults[-1]}")
-        with self._changing(f"mode {name}", session.stops if stops is None else stops):
+        policy = name != session.mode and session.config.control_modes[name].inference is not None
+        with self._changing(f"mode {name}", session.stops if stops is None else stops, policy):
             if name != session.mode:
                 self._enter(name)
             elif session.held:
@@ -241,8 +242,13 @@ class Runtime:
             return f"reset; {then}"
 
     @contextmanager
-    def _changing(self, what: str, stops: int) -> Iterator[None]:
+    def _changing(self, what: str, stops: int, policy: bool = False) -> Iterator[None]:
         """Change the state of the run when nobody else does, at the request of a user who knew of `stops` stops.
+
+        Args:
+            what: the change, for messages.
+            stops: as for `reset`.
+            policy: whether it starts one.
 
         Raises:
             IbrobotError: if the run has ended, or there were more emergency stops, when its turn comes.
@@ -253,7 +259,7 @@ class Runtime:
                 raise NotSupported(f"{what}: refused, the run ends")
             if session.stops > stops:
                 raise HardwareError(f"{what}: refused, an emergency stop came after it was requested")
-            session.authority.taken_over(what)
+            session.authority.taken_over(what, policy)
             yield
 
     def _go_on(self) -> None:

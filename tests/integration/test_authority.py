@@ -279,6 +279,30 @@ def test_agent_enters_modes_that_are_granted(run: AgentRun) -> None:
     assert run.moved(400) > 1.0
 
 
+@pytest.mark.parametrize(
+    ("service", "request_"),
+    [
+        ("/task/step", {"run_policy": {"mode": "model_inference", "seconds": 0.5}}),
+        ("/task/step", {"alternatives": [[{"run_policy": {"mode": "model_inference", "seconds": 0.5}}]]}),
+        ("/task/run", {"task": "steps:\n- run_policy: {mode: model_inference, seconds: 0.5}"}),
+    ],
+)
+def test_task_of_an_agent_starts_policies_only_if_modes_are_granted(
+    task_run: AgentRun, service: str, request_: Any
+) -> None:
+    modes = set()
+    task_run.session.on_state.append(lambda state: modes.add(task_run.session.mode))
+    outcomes = []
+    for granted in ((service,), (service, "/set_mode")):
+        task_run.grant(services=granted)
+        number = task_run.authority.call(task_run.agent, service, request_)
+        task_run.ticks(100)
+        result = task_run.session.bus.call("/task/result", number)
+        outcomes.append((result.outcome, "model_inference" in modes))
+    assert outcomes == [("FAILED", False), ("SUCCEEDED", True)]
+    assert task_run.session.mode == "moveit_planning"
+
+
 def test_grant_is_for_one_connection(run: AgentRun) -> None:
     second = run.authority.join("claude")
     with pytest.raises(RequestError, match="name one agent by `agent`; connected: 1:claude, 2:claude"):

@@ -40,7 +40,7 @@ class AgentCall:
     agent: str
     service: str
     request: str
-    """As JSON, cut to the longest that is shown."""
+    """As JSON; of one that is longer than what is shown, the beginning and how much is left out."""
     refused: bool
     plan: tuple[str, Any] | None
     """The service that plans the same without moving, and its request; None where none does."""
@@ -75,9 +75,15 @@ class AgentCalls:
             request = str(entry["request"])
             self._count += 1
             self.newest = AgentCall(
-                entry["agent"], service.name, request[:_LONGEST], entry["event"] == "refused",
+                entry["agent"], service.name, _shown(request), entry["event"] == "refused",
                 _plan(service.name, request), self._count,
             )  # fmt: skip
+
+
+def _shown(request: str) -> str:
+    """A request as far as it is shown: a person must see that there is more."""
+    left = len(request) - _LONGEST
+    return request if left <= 0 else f"{request[:_LONGEST]} … and {left} characters more"
 
 
 def _plan(service: str, request: str) -> tuple[str, Any] | None:

@@ -32,7 +32,7 @@ _JOINT_WIDTH = 41
 
 
 class RecentLog(logging.Handler):
-    """Keeps the last log lines for the panel."""
+    """Keeps the last messages for the panel; all lines but the first are indented, so that none looks like a row."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -41,7 +41,7 @@ class RecentLog(logging.Handler):
     @override
     def emit(self, record: logging.LogRecord) -> None:
         style = {logging.WARNING: "yellow", logging.ERROR: "bold red"}.get(record.levelno, "dim")
-        self.lines.append(styled(record.getMessage(), style))
+        self.lines.append(styled(record.getMessage().replace("\n", "\n  "), style))
 
 
 def panel(

@@ -320,3 +320,15 @@ def test_calls_are_counted_once_closed_no_more(rig: Rig) -> None:
     calls.close()
     rig.ask(agent)
     assert calls.newest.number == 2
+
+
+@pytest.mark.parametrize(("length", "more"), [(300, ""), (301, " … and 1 characters more"), (1900, " … and 1600 ")])
+def test_a_request_that_is_cut_says_so(rig: Rig, length: int, more: str) -> None:
+    calls = AgentCalls(rig.session)
+    agent = rig.authority.join("claude")
+    rig.ask(agent, request="home ".ljust(length - 2, "x"))
+    assert calls.newest is not None
+    assert calls.newest.request.startswith('"home xx')
+    assert calls.newest.request[300:].startswith(more)
+    assert bool(calls.newest.request[300:]) is bool(more)
+    calls.close()

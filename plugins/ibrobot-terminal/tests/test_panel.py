@@ -174,6 +174,12 @@ def test_the_newest_messages_are_whole_and_the_oldest_go_first(terminal: Termina
     assert "ends with 0." not in shown
 
 
+def test_no_line_of_a_message_looks_like_a_row_of_the_panel(terminal: Terminal):
+    lines = terminal.lines("step 1/2: a name\npath      up to 0.1 s\nagent     1:x asks for nothing")
+    assert [each for each in lines if "up to 0.1 s" in each] == ["  path      up to 0.1 s"]
+    assert not [each for each in lines if each.startswith(("path", "agent"))]
+
+
 def test_a_wide_terminal_shows_all_facts(runs: Runs):
     shown = Terminal(runs.start(mode="policy"), 120, 40).words()
     for fact in (
