@@ -12,8 +12,17 @@ import numpy as np
 type Pixels = np.ndarray[Any, Any]
 type Change = Callable[[str, Pixels, float], Pixels]
 
+
+def lost(every: int, state: Pixels) -> Pixels:
+    """The second joint without a number in some readings, which ones its value decides."""
+    found = state.copy()
+    if round(1e6 * state[1]) % every == 0:
+        found[1] = np.nan
+    return found
+
+
 STRENGTHS = ("mild", "medium", "strong")
-TIMES: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = {
+TIMES: dict[str, tuple[dict[str, Any], ...]] = {
     "observation_late": ({"state_age_s": 0.09}, {"state_age_s": 0.15}, {"state_age_s": 0.4}),
     "answers_slow": ({"latency_s": 0.6}, {"latency_s": 0.8}, {"latency_s": 1.1}),
     "plan_dry": (
@@ -26,6 +35,7 @@ TIMES: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = {
     "takeover": ({"takeover": (0.2, 0.5)}, {"takeover": (0.2, 0.6)}, {"takeover": (0.1, 0.9)}),
     "arm_not_following": ({"gain": {0: 0.7}}, {"gain": {0: 0.5}}, {"gain": {0: 0.0}}),
     "smoothing_averages": ({"torn": 0.15}, {"torn": 0.3}, {"torn": 0.6}),
+    "readings_missing": tuple({"seen": partial(lost, each)} for each in (13, 5, 1)),
     "stands_still": ({"idle_s": 4.0}, {"idle_s": 6.0}, {"idle_s": 9.0}),
 }  # fmt: skip
 """Cause -> what a run is made with, mild, medium and strong; found without a card."""

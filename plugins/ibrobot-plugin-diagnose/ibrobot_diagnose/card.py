@@ -29,6 +29,7 @@ SCHEMA, VERSION = "ibrobot card", 1
 LEVELS = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 1.0)
 WAY = 16
 """Positions of the way of an episode."""
+SERIES = ("seconds", "idle_start_s", "idle_end_s", "stall_s", "moving_speed", "jerk", "path")
 _OF_EPISODE, _IN_ALL, _POSES = 24, 480, 200
 """Most thumbnails of an episode and of a camera, and most start and end poses."""
 _RIDES = 2.0
@@ -191,10 +192,15 @@ class Card:
         rate = _finite(facts["rate_hz"], "rate_hz")
         if rate <= 0:
             raise ValueError("rate_hz must be above 0")
+        series = {str(name): _levels(each, name) for name, each in facts["series"].items()}
+        if missing := [name for name in SERIES if name not in series]:
+            raise ValueError(f"series lacks {missing[0]!r}")
+        if not isinstance(facts["trained"], dict | None) or not isinstance(facts["statistics"], dict | None):
+            raise ValueError("trained and statistics must be objects or null")
         return cls(
             rate, joints, dict(facts["contract"]), int(facts["episodes"]), int(facts["frames"]),
             {str(text): int(count) for text, count in facts["prompts"].items()}, **tables, **poses,
-            following=following, series={str(name): _levels(each, name) for name, each in facts["series"].items()},
+            following=following, series=series,
             ages_ms={str(name): _finite(each, name) for name, each in facts["ages_ms"].items()},
             cameras={str(key): _read_camera(each, len(joints)) for key, each in facts["cameras"].items()},
             norm_mode=facts["norm_mode"], trained=facts["trained"], statistics=facts["statistics"],
@@ -366,7 +372,7 @@ def jerk_of(window: Window) -> float:
 
 
 def series_of(window: Window) -> dict[str, float]:
-    """Numbers of an episode, of which a card has the quantiles."""
+    """Numbers of an episode, of which a card has the quantiles; their names are `SERIES`."""
     start, end, stall, _ = rests_of(window)
     states = window.states[np.isfinite(window.states).all(axis=1)]
     return {

@@ -47,8 +47,8 @@ OWN_NAMES = frozenset({
     "other_contract", "other_gripper", "other_model", "other_norm_mode", "other_prompt", "other_rate",
     "other_resolution", "other_robot", "other_speed", "other_units", "other_versions", "picture_black",
     "picture_blurred", "picture_bright", "picture_covered", "picture_dark", "picture_flipped", "picture_frozen",
-    "picture_gaps", "plan_dry", "requests_fail", "saturated", "smoothing_averages", "stall", "stands_still",
-    "statistics", "takeover", "ticks_missed", "unseen_pictures", "unseen_start", "unseen_states",
+    "picture_gaps", "plan_dry", "readings_missing", "requests_fail", "saturated", "smoothing_averages", "stall",
+    "stands_still", "statistics", "takeover", "ticks_missed", "unseen_pictures", "unseen_start", "unseen_states",
     "unseen_success", "white_balance", "zero_shifted",
 })  # fmt: skip
 """Names of the causes of this package, which no other can have. Discovery needs them, and imports no cause."""

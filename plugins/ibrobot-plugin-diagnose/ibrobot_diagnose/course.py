@@ -229,7 +229,7 @@ def begins_to_move(window: Window) -> float:
     if not known.any():
         return 0.0
     times, values = window.command.times_ns[known], values[known]
-    moved = np.abs(values - values[0]).max(axis=1) > _MOVED
+    moved = np.abs(values - values[0]).max(axis=1, initial=0.0) > _MOVED
     end = int(times[moved.argmax()]) if moved.any() else int(window.ticks_ns[-1])
     return (end - int(times[0])) / 1e9
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 RIG = "rig.json"
 """Name of the reference of a rig in the folder of a dataset."""
 _INFO = Path("meta") / "info.json"
+_MOST_EPISODES, _HIGHEST_RATE = 1_000_000, 10_000.0
 _NO_ANGLE = 10.0
 """Positions beyond it are no radians."""
 
@@ -55,9 +56,14 @@ def dataset_info(path: Path) -> dict[str, Any] | None:
     try:
         info = json.loads(file.read_text(encoding="utf-8"))
         info["total_episodes"], info["fps"] = int(info["total_episodes"]), float(info["fps"])
-        if not isinstance(info["features"], dict) or not 0 <= info["total_episodes"] <= 10_000_000:
-            raise ValueError("features or total_episodes are implausible")
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        features = info["features"]
+        if not isinstance(features, dict) or not all(isinstance(each, dict) for each in features.values()):
+            raise ValueError("features must be an object of objects")
+        if not 0 <= info["total_episodes"] <= _MOST_EPISODES:
+            raise ValueError(f"total_episodes must be from 0 to {_MOST_EPISODES}")
+        if not 0 < info["fps"] <= _HIGHEST_RATE:
+            raise ValueError(f"fps must be above 0, and at most {_HIGHEST_RATE}")
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise DatasetError(f"{file}: cannot be read: {error!r}") from None
     return dict(info)
 

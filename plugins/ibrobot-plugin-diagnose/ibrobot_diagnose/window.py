@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import attrs
@@ -17,6 +18,7 @@ from ibrobot_core.api import (
     NS_PER_S,
     Contract,
     EpisodeReader,
+    EpisodeSummary,
     Float64MultiArray,
     Image,
     JointState,
@@ -40,6 +42,16 @@ KEPT = 48
 """Pictures of each camera that are kept in a larger size, evenly over the window."""
 _STILLS = 3
 """Pictures of each camera that are kept in a still larger size."""
+_LOWEST_RATE, _HIGHEST_RATE = 0.01, 10_000.0
+"""Rates of a contract that are plausible [Hz]."""
+_MOST_TICKS = 1_000_000
+"""Ticks of the longest recording that is read; at 30 Hz these are nine hours."""
+_FARTHEST = 1e9
+"""Numbers beyond it are no positions, in whatever unit."""
+_SECTIONS: Mapping[str, type[Any]] = {
+    "robot": dict, "control": dict, "control_modes": dict, "models": dict, "peripherals": list, "contract": dict,
+}  # fmt: skip
+"""Sections of the robot YAML that causes look at."""
 
 
 @attrs.frozen(eq=False)
@@ -58,6 +70,7 @@ class Track:
     def of(cls, names: Sequence[str], rows: Sequence[tuple[int, int, Sequence[float]]]) -> Track:
         """A track of rows: time of receipt, stamp [ns], values."""
         values = np.array([row[2] for row in rows], np.float64).reshape(len(rows), len(names))
+        values[~(np.abs(values) <= _FARTHEST)] = np.nan
         times = [np.array([row[column] for row in rows], np.int64) for column in (0, 1)]
         return cls(tuple(names), times[0], times[1], values)
 
@@ -229,27 +242,43 @@ class Window:
 
     @cached_property
     def document(self) -> Mapping[str, Any]:
-        """The robot YAML as plain values; empty if the recording has none."""
-        try:
-            document = json.loads(self.metadata.get("config", "{}"))
-        except ValueError:
-            return {}
-        return document if isinstance(document, dict) else {}
+        """The robot YAML as plain values; empty if the recording has none.
+
+        Raises:
+            RecorderError: if it is damaged.
+        """
+        document = _object(self.metadata, "config", self.name)
+        for section, kind in _SECTIONS.items():
+            if not isinstance(document.get(section) or kind(), kind):
+                raise RecorderError(f"{self.name}: config: {section}: is no {kind.__name__} of the robot YAML")
+        joints = (document.get("robot") or {}).get("joints") or []
+        lists = {"robot.joints": joints, "peripherals": document.get("peripherals") or []}
+        modes = list((document.get("control_modes") or {}).values())
+        for name, listed in {**lists, "control_modes": modes}.items():
+            if not isinstance(listed, list) or not all(isinstance(each, dict) for each in listed):
+                raise RecorderError(f"{self.name}: config: {name}: has something else than objects")
+        for mode in modes:
+            dispatch = mode.get("dispatch") or {}
+            smoothing = dispatch.get("smoothing") or {} if isinstance(dispatch, dict) else None
+            coefficient = smoothing.get("temporal_ensemble_coeff", 0.0) if isinstance(smoothing, dict) else None
+            if not isinstance(coefficient, int | float) or abs(coefficient) > _FARTHEST:
+                raise RecorderError(f"{self.name}: config: control_modes: dispatch: is none of the robot YAML")
+        return document
 
     @cached_property
     def policy(self) -> Mapping[str, Any]:
-        """Name, type, fingerprint and weights of the policy that acted; empty without one."""
-        try:
-            policy = json.loads(self.metadata.get("policy", "{}"))
-        except ValueError:
-            return {}
-        return policy if isinstance(policy, dict) else {}
+        """Name, type, fingerprint and weights of the policy that acted; empty without one.
+
+        Raises:
+            RecorderError: if it is damaged.
+        """
+        return _object(self.metadata, "policy", self.name)
 
     @property
     def mode(self) -> Mapping[str, Any]:
         """The control mode in the robot YAML; empty if it is unknown."""
-        mode = (self.document.get("control_modes") or {}).get(self.metadata.get("mode", ""), {})
-        return mode if isinstance(mode, dict) else {}
+        mode: Mapping[str, Any] = (self.document.get("control_modes") or {}).get(self.metadata.get("mode", ""), {})
+        return mode
 
     @property
     def prompt(self) -> str:
@@ -260,7 +289,7 @@ class Window:
     @cached_property
     def limits(self) -> tuple[Limits, ...]:
         """The limits of the joints, as the robot YAML states them."""
-        known = {str(each.get("name")): each for each in (self.document.get("robot") or {}).get("joints", ())}
+        known = {str(each.get("name")): each for each in (self.document.get("robot") or {}).get("joints") or ()}
         return tuple(_limits(known.get(joint, {})) for joint in self.joints)
 
     def commander_at(self, t_ns: Times) -> list[str]:
@@ -268,6 +297,17 @@ class Window:
         times = [since for since, _ in self.commanders]
         index = np.searchsorted(np.array(times, np.int64), t_ns, side="right") - 1
         return [self.commanders[i][1] if i >= 0 else "" for i in index]
+
+
+def _object(metadata: Mapping[str, str], key: str, name: str) -> Mapping[str, Any]:
+    """An object in the metadata of a recording, which may come from anywhere; empty if it has none."""
+    try:
+        value = json.loads(metadata.get(key, "{}"))
+    except (ValueError, RecursionError) as error:
+        raise RecorderError(f"{name}: its metadata {key} cannot be read: {error}") from None
+    if not isinstance(value, dict):
+        raise RecorderError(f"{name}: its metadata {key} is no object")
+    return value
 
 
 def _limits(joint: Mapping[str, Any]) -> Limits:
@@ -283,13 +323,34 @@ def read_window(reader: EpisodeReader, name: str = "") -> Window:
     """
     summary = reader.summary()
     name = name or summary.path.name
-    contract = Contract.of_episode(summary.metadata)
+    return _Reading(_contract_of(summary), reader).window(name)
+
+
+def _contract_of(summary: EpisodeSummary) -> Contract:
+    """The contract of a recording, which may come from anywhere.
+
+    Raises:
+        RecorderError: if it has none, or one that is damaged.
+    """
+    try:
+        contract = Contract.of_episode(summary.metadata)
+    except RecursionError:
+        contract = None
     if contract is None:
         raise RecorderError(
             f"{summary.path}: has no contract, so it is unknown what was observed and commanded; ibrobot records one "
             "with every episode, and `ibrobot contract init` drafts one for foreign bags"
         )
-    return _Reading(contract, reader).window(name)
+    if not _LOWEST_RATE <= contract.rate_hz <= _HIGHEST_RATE:
+        raise RecorderError(
+            f"{summary.path}: the rate of its contract is {contract.rate_hz} Hz; it must be from {_LOWEST_RATE} to "
+            f"{_HIGHEST_RATE:g} Hz"
+        )
+    topics = [part.topic for part in (*contract.observation_parts, *contract.action_parts)]
+    names = [name for part in contract.action_parts for name in part.joints]
+    if not all(isinstance(each, str) for each in (*topics, *names)):
+        raise RecorderError(f"{summary.path}: its contract has a topic or a joint whose name is no text")
+    return contract
 
 
 class _Reading:
@@ -325,9 +386,7 @@ class _Reading:
         for item in self._reader.messages(wanted & there):
             message, t_ns = item.message, item.received_ns
             if isinstance(message, ModelAnswer):
-                joints = message.joint_names
-                size = len(joints)
-                self._asked.append(Asked(message, message.actions.reshape(-1, size) if size else np.empty((0, 0))))
+                self._asked.append(_asked_of(message, summary.path))
             elif item.topic in self._command_topics:
                 self._take_command(item.topic, message, t_ns)
             elif item.topic in self._pictures:
@@ -341,13 +400,21 @@ class _Reading:
                 self._commanders.append((t_ns, message.data))
         step_ns = contract.step_ns
         count = (summary.end_ns - summary.start_ns) // step_ns + 1 if there else 0
+        if count > _MOST_TICKS:
+            raise RecorderError(
+                f"{summary.path}: its messages span {(summary.end_ns - summary.start_ns) / NS_PER_S:.0f} s, {count} "
+                f"ticks of its contract; at most {_MOST_TICKS} are looked at. If the clock was set while it was "
+                "recorded, keep the part before or after: `ibrobot episodes trim`"
+            )
         ticks = summary.start_ns + np.arange(count, dtype=np.int64) * step_ns
-        return Window(
+        made = Window(
             name, contract, ticks, self._joints, Track.of(self._joints, self._states),
             Track.of(self._joints, self._commands), tuple(self._asked),
             {each.key: each for each in self._pictures.values()}, tuple(self._commanders), tuple(self._guarded),
             summary.metadata, summary.outcome, self._reader.sampled,
         )  # fmt: skip
+        _ = made.document, made.policy, made.limits  # what is damaged is named at once, not by a cause that needs it
+        return made
 
     def _take_state(self, message: JointState, t_ns: int) -> None:
         taken = False
@@ -389,6 +456,25 @@ class _Reading:
             camera.stills[t_ns] = shrink(shown, STILL_WIDTH)
         if not camera.kept or t_ns - camera.times_ns[max(camera.kept)] >= self._keep_every_ns:
             camera.kept[index] = shrink(shown)
+
+
+def _asked_of(message: ModelAnswer, path: Path) -> Asked:
+    """A request with its actions.
+
+    Raises:
+        RecorderError: if its numbers do not belong together, as in a recording that is damaged.
+    """
+    size, what = len(message.joint_names), f"{path}: answer {message.request} of the model"
+    if message.actions.size % max(1, size):
+        raise RecorderError(f"{what} has {message.actions.size} numbers for {size} joints")
+    if message.actions.size and (message.step_ns <= 0 or not size):
+        raise RecorderError(f"{what} has actions for {size} joints, {message.step_ns} ns apart")
+    if not 0 <= message.latency_ms <= _FARTHEST:
+        raise RecorderError(f"{what} took {message.latency_ms} ms")
+    chunk = message.actions.reshape(-1, size) if size else np.empty((0, 0))
+    if not (np.abs(chunk) <= _FARTHEST).all():
+        raise RecorderError(f"{what} has an action that is no finite number")
+    return Asked(message, chunk)
 
 
 def _rgb(message: Image) -> NDArray[np.uint8]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import base64
+import os
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
+from urllib.parse import quote
 
 from ibrobot_provenance.reports import Case, Cases, Plots, ReportSection, Table, Text
 from ibrobot_provenance.svg import tag
@@ -54,7 +56,8 @@ def as_page(out: Path, title: str, sections: Sequence[ReportSection], *, more: s
         '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(title)}</title><style>{_STYLE}</style>"
     )
-    return f'<!doctype html>\n<html lang="en"><head>{head}</head><body>{body}{more}</body></html>\n'
+    page = f'<!doctype html>\n<html lang="en"><head>{head}</head><body>{body}{more}</body></html>\n'
+    return page.encode("utf-8", "backslashreplace").decode()  # names of files may have bytes that are no text
 
 
 def _block(out: Path, block: Text | Table | Plots | Cases) -> str:
@@ -84,7 +87,7 @@ def _case(out: Path, case: Case) -> str:
     lines.append(tag("div", escape(case.text), class_="text"))
     if case.episode is not None:
         recording = str(case.episode.relative_to(out) if case.episode.is_relative_to(out) else case.episode)
-        lines.append(tag("div", tag("a", escape(recording), href=recording)))
+        lines.append(tag("div", tag("a", escape(recording), href=quote(os.fsencode(recording)))))
     if case.command:
         lines.append(tag("code", escape(case.command)))
     return tag("div", "".join(lines), class_="failure")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_diagnose.card import LEVELS, Card
-from ibrobot_diagnose.cause import CardCause, Cause, Evidence, likelihood
+from ibrobot_diagnose.cause import CardCause, Cause, Evidence, Reference, likelihood
 from ibrobot_diagnose.causes.pictures import pairs
 from ibrobot_diagnose.pictures import descriptors, nearest
 from ibrobot_diagnose.window import Floats, Window
@@ -83,6 +83,33 @@ def usual_offsets(card: Card) -> Floats:
     size = len(card.joints)
     result: Floats = np.quantile(np.abs(offsets), 0.95, axis=0) if offsets else np.zeros(size)
     return result
+
+
+class ReadingsMissing(Cause):
+    """Positions are no numbers."""
+
+    name = "readings_missing"
+    title = "each joint has a position in every reading"
+    needs = frozenset({"motion", "state"})
+    explains = _CONSEQUENCES | {"unseen_success", "joint_order", "joint_zero"}
+    remedy = (
+        "Look at this joint's cable and motor, and at what delivers its positions: a reading without a number was "
+        "recorded as it came. What is said of the arm's motion holds for the other readings only."
+    )
+
+    @override
+    def test(self, window: Window, reference: Reference) -> Evidence | None:
+        wanted = {name.removeprefix("position.") for part in window.contract.observation_parts for name in part.select}
+        shares = {}
+        for joint, values in zip(window.joints, window.state.values.T, strict=True):
+            if joint in wanted:
+                known = np.isfinite(values)
+                shares[joint] = float(1 - known[known.argmax() :].mean())  # a joint may be read first a little later
+        if not shares or not any(shares.values()):
+            return None
+        joint, share = max(shares.items(), key=lambda each: each[1])
+        text = f"{joint} has no position in {100 * share:.0f} % of the readings, or one that is no finite number."
+        return Evidence(text, 100 * share, "%", 2.0, likelihood(share, 0.02, 0.1))
 
 
 class OtherUnits(CardCause):
@@ -322,5 +349,5 @@ class GripperReversed(CardCause):
 
 
 CAUSES: tuple[type[Cause], ...] = (
-    OtherUnits, OtherNormMode, JointOrder, JointZero, GripperScaled, GripperReversed,
+    ReadingsMissing, OtherUnits, OtherNormMode, JointOrder, JointZero, GripperScaled, GripperReversed,
 )  # fmt: skip

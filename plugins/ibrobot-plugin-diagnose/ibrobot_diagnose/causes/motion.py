@@ -8,7 +8,7 @@ import numpy as np
 
 from ibrobot_diagnose.cause import Cause, Evidence, Reference, likelihood
 from ibrobot_diagnose.course import begins_to_move, changes_of, conflict_of, course_of, delay_of
-from ibrobot_diagnose.window import Window
+from ibrobot_diagnose.window import Floats, Window
 
 
 class ArmNotFollowing(Cause):
@@ -25,8 +25,7 @@ class ArmNotFollowing(Cause):
     @override
     def test(self, window: Window, reference: Reference) -> Evidence | None:
         delays, rests = delay_of(window)
-        ranges = np.nanmax(window.states, axis=0) - np.nanmin(window.states, axis=0)
-        asked = np.nanmax(window.commands, axis=0) - np.nanmin(window.commands, axis=0)
+        ranges, asked = _ranges(window.states), _ranges(window.commands)
         for gripper in (i for i, joint in enumerate(window.joints) if "grip" in joint or "jaw" in joint):
             if ranges[gripper] > 0.1 * asked[gripper]:  # it holds something
                 rests[gripper] = np.nan
@@ -59,6 +58,14 @@ class ArmNotFollowing(Cause):
         return Evidence(
             text, rest, "rad", float(usual[j]), likelihood(float(ratio[j]), 1.0, 2.0), details=tuple(details)
         )
+
+
+def _ranges(values: Floats) -> Floats:
+    """How far each joint moves [rad], shape (J,); 0 for one that is unknown."""
+    known = np.isfinite(values)
+    low, high = (np.where(known, values, bound) for bound in (np.inf, -np.inf))
+    result: Floats = np.maximum(high.max(axis=0, initial=-np.inf) - low.min(axis=0, initial=np.inf), 0.0)
+    return result
 
 
 class SmoothingAverages(Cause):
