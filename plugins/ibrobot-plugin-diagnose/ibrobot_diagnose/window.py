@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -346,10 +347,12 @@ def _contract_of(summary: EpisodeSummary) -> Contract:
             f"{summary.path}: the rate of its contract is {contract.rate_hz} Hz; it must be from {_LOWEST_RATE} to "
             f"{_HIGHEST_RATE:g} Hz"
         )
-    topics = [part.topic for part in (*contract.observation_parts, *contract.action_parts)]
-    names = [name for part in contract.action_parts for name in part.joints]
+    names: list[object] = [name for part in contract.action_parts for name in part.joints]
+    topics = [*(part.topic for part in contract.observation_parts), *(part.topic for part in contract.action_parts)]
     if not all(isinstance(each, str) for each in (*topics, *names)):
         raise RecorderError(f"{summary.path}: its contract has a topic or a joint whose name is no text")
+    if twice := [name for name, count in Counter(names).items() if count > 1]:
+        raise RecorderError(f"{summary.path}: its contract commands {twice[0]} twice, so its joints are unknown")
     return contract
 
 
@@ -413,7 +416,7 @@ class _Reading:
             {each.key: each for each in self._pictures.values()}, tuple(self._commanders), tuple(self._guarded),
             summary.metadata, summary.outcome, self._reader.sampled,
         )  # fmt: skip
-        _ = made.document, made.policy, made.limits  # what is damaged is named at once, not by a cause that needs it
+        _ = made.document, made.policy  # what is damaged is named at once, not by a cause that needs it
         return made
 
     def _take_state(self, message: JointState, t_ns: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, override
 
 import attrs
@@ -18,7 +18,15 @@ from ibrobot_diagnose.report import Explanation
 from ibrobot_diagnose.window import Window, read_window
 from made_runs import START_NS, Made, Run, metadata, window_of
 
-from ibrobot_core.api import DatasetError, EpisodeSummary, JointState, ModelAnswer, Recorded, RecorderError
+from ibrobot_core.api import (
+    DatasetError,
+    EpisodeSummary,
+    Float64MultiArray,
+    JointState,
+    ModelAnswer,
+    Recorded,
+    RecorderError,
+)
 
 RUN = Run(seed=3, seconds=2, cameras=(), outcome="failure")
 type Change = Callable[[Recorded], Recorded]
@@ -29,7 +37,7 @@ class Changed(Made):
 
     def __init__(self, change: Change = lambda item: item, run: Run = RUN, **more: str) -> None:
         super().__init__(run)
-        self._messages: Sequence[Recorded] = [change(item) for item in self._messages]
+        self._messages = [change(item) for item in self._messages]
         self._more = more
 
     @override
@@ -125,6 +133,25 @@ def test_contract_without_joints_is_diagnosed():
     contract = json.loads(metadata(RUN)["contract"])
     contract["action"][0]["joints"] = []
     assert diagnose(read_window(Changed(contract=json.dumps(contract))), Reference()).broken == ()
+
+
+def test_contract_that_names_a_joint_twice_is_refused():
+    contract = json.loads(metadata(RUN)["contract"])
+    contract["action"][0]["joints"][1] = "pan"
+    with pytest.raises(RecorderError, match="made: its contract commands pan twice"):
+        read_window(Changed(contract=json.dumps(contract)))
+
+
+def test_commands_that_are_no_numbers_are_what_is_accused():
+    def change(item: Recorded) -> Recorded:
+        if not isinstance(item.message, Float64MultiArray) or item.received_ns % 3:
+            return item
+        return attrs.evolve(item, message=Float64MultiArray(np.array([0.0, 0.0, np.inf, 0.0])))
+
+    diagnosis = diagnose(read_window(Changed(change)), Reference())
+    assert diagnosis.first == "readings_missing"
+    assert "elbow has no position in" in diagnosis.findings[0].evidence.text
+    assert "of the commands" in diagnosis.findings[0].evidence.text
 
 
 @pytest.fixture(scope="module")

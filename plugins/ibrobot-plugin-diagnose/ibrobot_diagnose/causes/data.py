@@ -26,7 +26,10 @@ class OtherPrompt(CardCause):
     def compare(self, window: Window, card: Card) -> Evidence | None:
         known = [text for text in card.prompts if text]
         if "demonstration" in window.streams:  # the others of a dataset may have the same fault
-            known = [text for text in known if card.prompts[text] > 0.1 * max(card.prompts.values())]
+            most = max(card.prompts.values())
+            if most < 2:
+                return None  # each of the others has a task of its own
+            known = [text for text in known if card.prompts[text] > 0.1 * most]
         if not window.prompt or not known or window.prompt in known:
             return None
         asked = any(each.answer.prompt for each in window.asked)
@@ -54,10 +57,14 @@ class UnseenStart(CardCause):
         known = np.flatnonzero(np.isfinite(window.states).all(axis=1))
         if window.joints != card.joints or not len(known):
             return None
+        if "demonstration" in window.streams and len(card.starts) < 2:
+            return None  # two episodes say nothing of where others begin
         start = window.states[known[0]]
         few = 0.03 if len(card.starts) >= 30 else 0.0  # of many, some begin anywhere
         low, high = np.quantile(card.starts, (few, 1 - few), axis=0)
-        room = 0.25 * (high - low)
+        # What a policy never saw it has to guess; an episode that begins elsewhere than a few others is usual.
+        share = _room(len(card.starts)) if "demonstration" in window.streams else _ROOM
+        room = share * (high - low)
         off = np.maximum(np.maximum(low - room - start, start - high - room), 0.0)
         j = int(np.argmax(off))
         text = (
@@ -66,6 +73,19 @@ class UnseenStart(CardCause):
             f"which begin from {low[j]:.2f} to {high[j]:.2f} rad."
         )
         return Evidence(text, float(off[j]), "rad", 0.1, likelihood(float(off[j]), 0.1, 0.25), 0.0)
+
+
+_ROOM = 0.25
+"""How far beyond the range of the starts a run may begin, as a share of that range."""
+
+
+def _room(count: int) -> float:
+    """How far beyond the range of a few starts the next one may lie, as a share of that range.
+
+    Of starts that are spread evenly, the next one lies farther outside in one case of a hundred: the chance is
+    2 / (count + 1) to lie outside at all, and falls with the power count - 1 of the range with its room.
+    """
+    return max(_ROOM, float((200 / (count + 1)) ** (1 / (count - 1))) - 1)
 
 
 class UnseenStates(CardCause):

@@ -93,22 +93,24 @@ class ReadingsMissing(Cause):
     needs = frozenset({"motion", "state"})
     explains = _CONSEQUENCES | {"unseen_success", "joint_order", "joint_zero"}
     remedy = (
-        "Look at this joint's cable and motor, and at what delivers its positions: a reading without a number was "
-        "recorded as it came. What is said of the arm's motion holds for the other readings only."
+        "Look at this joint's cable and motor, and at what delivers its positions: what was no number was recorded as "
+        "it came. What is said of the motion holds for the rest only, and no training bears such a number."
     )
 
     @override
     def test(self, window: Window, reference: Reference) -> Evidence | None:
         wanted = {name.removeprefix("position.") for part in window.contract.observation_parts for name in part.select}
-        shares = {}
-        for joint, values in zip(window.joints, window.state.values.T, strict=True):
-            if joint in wanted:
+        worst = 0.0, "", ""
+        for what, track in (("readings", window.state), ("commands", window.command)):
+            for joint, values in zip(window.joints, track.values.T, strict=True):
                 known = np.isfinite(values)
-                shares[joint] = float(1 - known[known.argmax() :].mean())  # a joint may be read first a little later
-        if not shares or not any(shares.values()):
+                if len(known) and (known.any() or (what == "readings" and joint in wanted)):
+                    # A joint may come first a little later than the others.
+                    worst = max(worst, (float(1 - known[known.argmax() :].mean()), joint, what))
+        share, joint, what = worst
+        if share <= 0:
             return None
-        joint, share = max(shares.items(), key=lambda each: each[1])
-        text = f"{joint} has no position in {100 * share:.0f} % of the readings, or one that is no finite number."
+        text = f"{joint} has no position in {100 * share:.0f} % of the {what}, or one that is no finite number."
         return Evidence(text, 100 * share, "%", 2.0, likelihood(share, 0.02, 0.1))
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import attrs
 from ibrobot_provenance.jobs import Job, open_pool
 
-from ibrobot_core.api import DatasetError
+from ibrobot_core.api import DatasetError, RecorderError
 from ibrobot_core.app import Emit, Unsuccessful, echo, wrong_input
 from ibrobot_diagnose.card import Card, Maker
 from ibrobot_diagnose.cause import Reference, Shown
@@ -41,7 +41,7 @@ class CheckDataset(CheckOptions):
     def __call__(self, emit: Emit) -> dict[str, Any] | None:
         episodes = find_episodes([self.dataset])
         if len(episodes) < 2:
-            raise DatasetError(f"{self.dataset}: has {len(episodes)} episodes; at least 2 are needed to compare them")
+            raise DatasetError(f"{self.dataset}: episodes: {len(episodes)}; at least 2 are needed to compare them")
         checked, shown = _checked(self, episodes, emit)
         if self.out is not None:
             from ibrobot_diagnose.check_contents import write_check
@@ -149,6 +149,10 @@ def check_episode(order: tuple[Path, Card], progress: Callable[[int], None] = la
     """
     episode, card = order
     window = read_episode(episode)
+    if "state" not in window.streams:
+        raise RecorderError(
+            f"{episode}: nothing can be checked: it has {len(window.state.times_ns)} readings of joints"
+        )
     diagnosis = diagnose(window, Reference(card))
     findings = diagnosis.findings
     shown = list(findings[0].evidence.pictures) if findings else []
