@@ -104,6 +104,15 @@ def test_check_lists_the_worst_episode_first(folder):
 
 
 @pytest.mark.usefixtures("fork_server")
+def test_episodes_of_a_single_reading_are_not_said_to_be_like_one_another(tmp_path):
+    for number in range(2):
+        record(tmp_path / "episodes" / f"episode_{number}", Run(seed=number, acts=False, seconds=0.01, cameras=()))
+    done = run_here("datasets", "check", tmp_path, "--jobs", 1)
+    assert done.returncode == 1
+    assert done.stderr.count("nothing can be checked: it has 1 readings of joints") == 2
+
+
+@pytest.mark.usefixtures("fork_server")
 def test_check_writes_a_report_with_what_mends_each_episode(folder, tmp_path):
     from ibrobot_diagnose.check_contents import lines_of, read_contents
 
