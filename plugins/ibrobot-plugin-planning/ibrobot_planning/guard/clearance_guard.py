@@ -106,6 +106,11 @@ class ClearanceGuard(Guard):
         of_world = {"world_changes": building.changes, "refused_objects": building.refused}
         return self._counts | of_world | {"distances": pairs.measured, "pairs": len(pairs.names)}
 
+    @property
+    def strays(self) -> Vector:
+        """How far the margin of the last command lets each joint of the model be from its path [rad], shape (M,)."""
+        return self._strays.copy()
+
     @override
     def accept(self, position: Vector, velocity: Vector, setpoint: Vector, measured: Vector) -> Vector:
         columns = self._joints.columns
