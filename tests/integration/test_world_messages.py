@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from entrance_table import PAGE
 from entrances import FAR, WALL
+from ibrobot_eval.episodes import interventions
 from ibrobot_planning.world.checked_arm import may_touch_arm
 from ibrobot_planning.world.collision import Collisions
 from ibrobot_planning.world.objects import Voxels, World, WorldObject, observed_world
@@ -415,5 +416,43 @@ def test_clouds_of_20000_cells_that_move_are_kept_off(tmp_path: Path) -> None:
         checks = Collisions(arm, World({"cells": only}), arm.joint_names)
         assert checks.free(told.run.commands[-1])
         assert read_rows()["dense clouds"] == "taken"
+    finally:
+        told.entrance.close()
+
+
+@pytest.mark.usefixtures("_policy")
+def test_every_change_is_known_within_two_ticks(tmp_path: Path) -> None:
+    told = Told(tmp_path)
+    box = {"shape": "box", "size": [0.02] * 3}
+    changes = {
+        "add": told.add(**box), "replace": told.add(**{**box, "position": [0.6, 0.6, 0.6]}), "move": told.move(),
+        "touch": partial(told.call, "/world/touch", {"objects": ["it"]}),
+        "allow": partial(told.call, "/world/allow", {"name": "it", "may_touch": ["wall"]}),
+        "attach": partial(told.call, "/world/attach", {"name": "it", "link": _LINK}),
+        "detach": partial(told.call, "/world/detach", {"name": "it"}),
+        "remove": partial(told.call, "/world/remove", {"name": "it"}),
+    }  # fmt: skip
+
+    def known() -> int:
+        return int(told.run.session.control.call(GetCounters())["guard"]["world_changes"])
+
+    try:
+        for name, change in changes.items():
+            before = known()
+            change()
+            told.tick(2)
+            assert known() == before + 1, name
+    finally:
+        told.entrance.close()
+
+
+@pytest.mark.usefixtures("_policy")
+def test_an_evaluation_counts_what_the_guard_has_changed(tmp_path: Path) -> None:
+    told = Told(tmp_path)
+    try:
+        told.tick(10)
+        assert "guard" not in interventions(told.run.session)
+        told.tick(200)
+        assert interventions(told.run.session)["guard"] > 10
     finally:
         told.entrance.close()

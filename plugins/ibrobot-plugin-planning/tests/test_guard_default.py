@@ -165,6 +165,15 @@ def test_a_permission_for_a_name_that_is_not_there_is_warned_of(
     assert not warned or lines[0].startswith(f"control.guard.{warned}")
 
 
+def test_hulls_of_links_without_collision_geometry_are_named(
+    make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    text = robot_yaml(tmp_path)
+    with caplog.at_level(logging.INFO):
+        make(FLOOR, "default_control_mode=idle", text=text).start()
+    assert "takes hulls of visible meshes for links without collision geometry: base\n" in caplog.text
+
+
 def test_a_model_without_geometry_says_how_to_go_on(make: Make, tmp_path: Path) -> None:
     text = robot_yaml(tmp_path)
     model = tmp_path / "arm.xml"

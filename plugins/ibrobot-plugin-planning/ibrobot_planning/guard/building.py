@@ -69,6 +69,8 @@ class Building:
         self._lock = threading.Lock()
         """Held for the start and the end of the thread, never while it builds."""
         self.finished: deque[Finished] = deque()
+        self.old: deque[Pairs] = deque()
+        """Those that the loop has no more: freeing them takes longer than it has time."""
         self.changes = self.refused = 0
         """Number of changes, and of objects that were left out."""
 
@@ -96,6 +98,8 @@ class Building:
             self._build(changes)
 
     def _build(self, changes: list[WorldChange]) -> None:
+        while self.old:
+            self.old.popleft().let_go()
         world = self._world
         for change in changes:
             usable = {name: thing for name, thing in change.changed.items() if self._is_usable(name, change)}

@@ -240,6 +240,7 @@ class ClearanceGuard(Guard):
         self._stale = finished.stale
         if finished.pairs is not None:
             finished.pairs.take_over(self._pairs)
+            self._building.old.append(self._pairs)
             self._pairs = finished.pairs
         if finished.moved:
             placements = {name: pinocchio.SE3(matrix(pose)) for name, pose in finished.moved}

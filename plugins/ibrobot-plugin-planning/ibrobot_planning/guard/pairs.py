@@ -102,6 +102,11 @@ class Pairs:
         """The configuration of each [rad]."""
         self._longest = np.array([part.levers.max(axis=0, initial=0.0) for part in self.parts])
         """Largest motion of the pairs of each part per joint [m/rad]."""
+        numbers: dict[Pair, list[int]] = {}
+        for number, pair in enumerate(self.names):
+            numbers.setdefault(pair, []).append(number)
+        self._named = {pair: np.array(alike, dtype=np.intp) for pair, alike in numbers.items()}
+        """The pairs of each two names."""
         self.measured = 0
         """Number of distances measured so far."""
         self.left = 0
@@ -116,14 +121,20 @@ class Pairs:
         for number in near.tolist():
             name = other.names[number]
             before[name] = min(before.get(name, math.inf), float(other.limits[number]))
+        for name, limit in before.items():
+            if (alike := self._named.get(name)) is not None:
+                self.limits[alike] = np.minimum(self.limits[alike], limit)
         for new, (part, at) in enumerate(zip(self.parts, self._slices, strict=True)):
             if (old := known.get(id(part))) is not None:
                 was = other._slices[old]
                 self._known[at], self._at[at], self.limits[at] = other._known[was], other._at[was], other.limits[was]
                 self._room[new], self._seen[new] = other._room[old], other._seen[old]
-            else:
-                for number, name in enumerate(part.names, at.start) if before else ():
-                    self.limits[number] = min(self.limits[number], before.get(name, math.inf))
+
+    def let_go(self) -> None:
+        """Free what nobody else has of it, in steps; it is not used any more."""
+        while self.parts:
+            self.parts.pop()
+            self._pause()
 
     def note_moved(self, objects: Mapping[str, WorldObject]) -> None:
         """Have it that objects are elsewhere, as the loop learns by `move`: for `before`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import batched, product
 from typing import Any, Self
@@ -19,12 +20,16 @@ from ibrobot_planning.world.coal_shapes import boxes, geometry, hull
 from ibrobot_planning.world.collision import Engine, checked_pairs, object_shapes
 from ibrobot_planning.world.objects import Box, Boxes, Voxels, World, WorldObject
 
+type Cells = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+
 _MOST = 16
 """Objects of a part, or blocks of cells: one call that makes a part takes no longer, and the loop waits for calls."""
 _BLOCK = 3
 """Edge of a block of cells, in cells; it counts as the convex hull of its cells."""
 _MOST_BLOCKS = 2000
 """Blocks of a cloud; of one that has more, blocks are larger."""
+_LARGEST = 2**62
+"""Cells of a grid whose numbers are certainly whole numbers of numpy."""
 _CORNERS = np.array(list(product((0, 1), repeat=3)))
 """Of a cell, from its index on."""
 _CONVEX = (coal.Halfspace, coal.Box, coal.Sphere, coal.Capsule, coal.Cylinder, coal.ConvexBase)
@@ -194,9 +199,9 @@ def _blocks(shape: Voxels | Boxes) -> Iterator[tuple[Any, Vector]]:
 
 def _blocks_of_cells(cloud: Voxels) -> Iterator[tuple[Any, Vector]]:
     """Neighbouring cells in one shape; a convex one takes a fiftieth of the time of an octree."""
-    edge, cells = _BLOCK, np.unique(cloud.cells, axis=0)
+    edge, cells = _BLOCK, _unique(cloud.cells)[0]
     while True:
-        _, which = np.unique(cells // edge, axis=0, return_inverse=True)
+        which = _unique(cells // edge)[1]
         if which.max() < _MOST_BLOCKS:
             break
         edge *= 2
@@ -214,6 +219,16 @@ def _blocks_of_cells(cloud: Voxels) -> Iterator[tuple[Any, Vector]]:
         corners = (block[:, None] - low + _CORNERS).reshape(-1, 3)
         _, first = np.unique(corners @ (1, edge + 1, (edge + 1) ** 2), return_index=True)
         yield hull(corners[first] * cloud.size), placed
+
+
+def _unique(cells: Cells) -> tuple[Cells, Cells]:
+    """The different rows in order, shape (N, 3), and which of them each row is; the loop waits for sorting rows."""
+    low, sizes = cells.min(axis=0), np.ptp(cells, axis=0) + 1
+    if math.prod(sizes.tolist()) >= _LARGEST:
+        rows, which = np.unique(cells, axis=0, return_inverse=True)
+        return rows, which.reshape(-1)
+    numbers, which = np.unique(np.ravel_multi_index((cells - low).T, sizes), return_inverse=True)
+    return np.stack(np.unravel_index(numbers, sizes), axis=1) + low, which
 
 
 def _has_sphere(shape: LinkShape) -> bool:
