@@ -123,8 +123,9 @@ def changes(count: int = 30) -> dict[str, float]:
             loop.world(WorldChange(boxes(20, np.random.default_rng(1))))
             standing = WorldObject(Box((0.05, 0.05, 0.05)), Pose(Vector3(0.3, 0.3, 0.2)))
             carried = WorldObject(Box((0.02, 0.02, 0.02)), Pose(Vector3(0.0, 0.0, 0.05)), hand, frozenset({hand}))
+            moved = {"it": Pose(Vector3(0.3, 0.3, 0.3))}
             kinds = {
-                "add": WorldChange({"it": standing}), "move": WorldChange({}, moved={"it": Pose(Vector3(0.3, 0.3, 0.3))}),
+                "add": WorldChange({"it": standing}), "move": WorldChange({}, moved=moved),
                 "attach": WorldChange({"it": carried}), "detach": WorldChange({"it": standing}),
                 "remove": WorldChange({}, ("it",)),
             }  # fmt: skip

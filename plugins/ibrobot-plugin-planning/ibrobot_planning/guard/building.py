@@ -20,7 +20,7 @@ from ibrobot_planning.world.objects import Boxes, Voxels, World
 
 _MOST_WAITING = 32
 """Worlds that wait for a loop that takes none, e.g. since the robot holds after a fault; then one takes their place."""
-_SWITCH_S = 0.0005
+_SWITCH_S = 0.0001
 """How long the thread may keep the loop of the same process waiting [s]; 5 ms is Python's default."""
 
 

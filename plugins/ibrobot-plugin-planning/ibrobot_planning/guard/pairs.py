@@ -102,10 +102,7 @@ class Pairs:
         """The configuration of each [rad]."""
         self._longest = np.array([part.levers.max(axis=0, initial=0.0) for part in self.parts])
         """Largest motion of the pairs of each part per joint [m/rad]."""
-        numbers: dict[Pair, list[int]] = {}
-        for number, pair in enumerate(self.names):
-            numbers.setdefault(pair, []).append(number)
-        self._named = {pair: np.array(alike, dtype=np.intp) for pair, alike in numbers.items()}
+        self._named = _numbered(self.names)
         """The pairs of each two names."""
         self.measured = 0
         """Number of distances measured so far."""
@@ -356,6 +353,14 @@ class Pairs:
         moving = (normals @ jacobian[:3])[:, None] * self._moves[pairs] + np.einsum("ksc,kscj->ksj", arms, turns)
         rates = moving[:, 1] - moving[:, 0]
         return normals, rates, turns
+
+
+def _numbered(names: Sequence[Pair]) -> Mapping[Pair, Indices]:
+    """The numbers of the pairs of each two names."""
+    numbers: dict[Pair, list[int]] = {}
+    for number, pair in enumerate(names):
+        numbers.setdefault(pair, []).append(number)
+    return {pair: np.array(alike, dtype=np.intp) for pair, alike in numbers.items()}
 
 
 def _cross(a: Vector, b: Vector) -> Vector:
