@@ -679,6 +679,29 @@ def test_a_world_that_is_deleted_in_motion_and_comes_back(tmp_path, at: int, del
     assert nearest > min(room, MARGIN_M) - 0.001
 
 
+def flickering(kind: str, rng: np.random.Generator, number: int) -> WorldObject:
+    """A wall, of which every other time a layer in front is seen in part, or that is measured to be thicker."""
+    if kind == "box":
+        wall = WALL["wall"]
+        return attrs.evolve(wall, shape=Box((0.4, 0.02 + 0.002 * (number % 2), 0.3)))
+    wall = np.array(list(itertools.product(range(15, 45), (-1, 0), range(30))))
+    front = np.array(list(itertools.product(range(15, 45), (1,), range(30))))
+    seen = rng.random(len(front)) < 0.3 * (number % 2)
+    return WorldObject(Voxels(0.01, np.concatenate([wall, front[seen]])))
+
+
+@pytest.mark.parametrize("kind", ["cloud", "box"])
+def test_what_is_seen_differently_each_time_is_not_come_nearer_to(tmp_path, kind: str) -> None:
+    loop, rng, nearest = Loop(tmp_path, LEFT), np.random.default_rng(0), []
+    seen = Seen({"wall": box(0.3, 0.0, 0.15, 0.3, 0.02, 0.3)})
+    for number in range(44):
+        loop.world({"wall": flickering(kind, rng, number)})
+        loop.go(ACROSS, 5)
+        nearest.append(seen.distance(loop.position))
+    assert nearest[-1] > min(nearest[12:20]) - 0.0001
+    assert nearest[-1] > 0.0025
+
+
 def test_an_object_that_comes_into_the_way_is_braked_for(tmp_path) -> None:
     """It was far: what was known of its distance does not count any more."""
     loop = Loop(tmp_path, LEFT)

@@ -239,7 +239,7 @@ class ClearanceGuard(Guard):
         """Have a world that is finished."""
         self._stale = finished.stale
         if finished.pairs is not None:
-            finished.pairs.take_over(self._pairs)
+            finished.pairs.take_over(self._pairs, self._begin)
             self._building.old.append(self._pairs)
             self._pairs = finished.pairs
         if finished.moved:

@@ -102,30 +102,43 @@ class Pairs:
         """The configuration of each [rad]."""
         self._longest = np.array([part.levers.max(axis=0, initial=0.0) for part in self.parts])
         """Largest motion of the pairs of each part per joint [m/rad]."""
-        self._named = _numbered(self.names)
-        """The pairs of each two names."""
         self.measured = 0
         """Number of distances measured so far."""
         self.left = 0
         """How much may still be looked at in this tick; without any, what is not proved is blocked."""
 
-    def take_over(self, other: Pairs) -> None:
-        """Know what another one knows, and have its limits where pairs were nearer than their margin."""
+    def take_over(self, other: Pairs, q: Vector) -> None:
+        """Know what another one knows, while the joints are at `q`, shape (J,).
+
+        Pairs that are new, but whose names were near one another before, may come no nearer than those might: what is
+        sent again and again, e.g. a cloud that flickers, does not let the arm come nearer by what is allowed for
+        rounding, again and again.
+        """
         known = {id(part): old for old, part in enumerate(other.parts)}
         self.measured += other.measured
-        near = np.flatnonzero(other.limits < other.margins)
-        before: dict[Pair, float] = {}
-        for number in near.tolist():
-            name = other.names[number]
-            before[name] = min(before.get(name, math.inf), float(other.limits[number]))
-        for name, limit in before.items():
-            if (alike := self._named.get(name)) is not None:
-                self.limits[alike] = np.minimum(self.limits[alike], limit)
         for new, (part, at) in enumerate(zip(self.parts, self._slices, strict=True)):
             if (old := known.get(id(part))) is not None:
                 was = other._slices[old]
                 self._known[at], self._at[at], self.limits[at] = other._known[was], other._at[was], other.limits[was]
                 self._room[new], self._seen[new] = other._room[old], other._seen[old]
+        is_made = np.array([id(part) not in known for part in self.parts])
+        near = self._within_margin(q, np.flatnonzero(is_made[self._of]))
+        if not len(near):
+            return
+        before = other._within_margin(q, np.arange(len(other.names)))
+        left: dict[Pair, float] = {}
+        for number, room in zip(before.tolist(), (other._known[before] - other.limits[before]).tolist(), strict=True):
+            name = other.names[number]
+            left[name] = min(left.get(name, math.inf), max(room, -_SLACK_M))
+        for number in near.tolist():
+            if (room := left.get(self.names[number])) is not None:
+                self.limits[number] = min(self.margins[number], self._known[number] - room)
+
+    def _within_margin(self, q: Vector, among: Indices) -> Indices:
+        """Those of some pairs that are nearer than their margins while the joints are at `q`, measured there."""
+        moved = np.einsum("pj,pj->p", np.abs(q - self._at[among]), self.levers[among])
+        among = among[self._known[among] - moved < self.margins[among]]
+        return among[self.distances(q, among) < self.margins[among]]
 
     def let_go(self) -> None:
         """Free what nobody else has of it, in steps; it is not used any more."""
@@ -142,7 +155,7 @@ class Pairs:
         """Move objects that stand in the base frame, each to a pinocchio.SE3, while the joints are at `q`.
 
         The limit of a pair that is near moves along: an object that trembles does not let the arm come nearer by
-        what is allowed for rounding, each time anew.
+        what is allowed for rounding, again and again.
         """
         self._set(q)
         for number, (part, at) in enumerate(zip(self.parts, self._slices, strict=True)):
@@ -353,14 +366,6 @@ class Pairs:
         moving = (normals @ jacobian[:3])[:, None] * self._moves[pairs] + np.einsum("ksc,kscj->ksj", arms, turns)
         rates = moving[:, 1] - moving[:, 0]
         return normals, rates, turns
-
-
-def _numbered(names: Sequence[Pair]) -> Mapping[Pair, Indices]:
-    """The numbers of the pairs of each two names."""
-    numbers: dict[Pair, list[int]] = {}
-    for number, pair in enumerate(names):
-        numbers.setdefault(pair, []).append(number)
-    return {pair: np.array(alike, dtype=np.intp) for pair, alike in numbers.items()}
 
 
 def _cross(a: Vector, b: Vector) -> Vector:
