@@ -194,6 +194,13 @@ def test_stop_inside_the_range_is_refused(rig, end):
     rig.refuses("shoulder_pan: between both places where it stops are 19[0-9] deg, its limits are 220 deg apart")
 
 
+@pytest.mark.parametrize("off", [-500, 300])
+def test_start_in_another_than_the_middle_pose_is_refused(rig, off):
+    """Its stops are right, but 0 rad is where the arm stood."""
+    rig.emulator.servos[3].mechanics = mechanics_of("elbow_flex", *SO101["elbow_flex"], MIDDLE + off)
+    rig.refuses("elbow_flex: the middle of its range is (26|44) deg from the middle pose, which is its 0 deg")
+
+
 def test_cable_that_pulls_is_no_stop(rig):
     mechanics = rig.mechanics(1)
     mechanics.cable = mechanics.high - 220

@@ -147,7 +147,7 @@ def measure_by_motor(
     missing_servos(bus, joints)
     finder = StopFinder(
         bus, guide, joints, measured=[joint for joint in joints if joint.name not in full_turn], compared=compared,
-        torque=torque, asks=not yes, signs=answers.check_signs, clock=clock,
+        zero_at=zero_at, torque=torque, asks=not yes, signs=answers.check_signs, clock=clock,
     )  # fmt: skip
     try:
         with finder.restoring():

@@ -23,7 +23,7 @@ from ibrobot_core.app import Declined
 from ibrobot_feetech.arm import hold, relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.joints import Joint
-from ibrobot_feetech.commands.ranges import Range, homing_offset
+from ibrobot_feetech.commands.ranges import Range, doubtful, homing_offset
 from ibrobot_feetech.errors import FeetechError, NoReply
 from ibrobot_feetech.protocol import faults
 from ibrobot_feetech.supply import check_supply, supply
@@ -133,6 +133,7 @@ class StopFinder:
         joints: the arm's joints.
         measured: those whose stops are found; the others can make a full turn.
         compared: joints whose range is compared with their limits.
+        zero_at: position of 0 rad, one of `calibration.ZERO_AT`.
         torque: share of the stall torque that no servo exceeds.
         asks: whether a person says, before a joint is measured, that it is the one that moves.
         signs: whether a person says which direction is positive.
@@ -141,11 +142,11 @@ class StopFinder:
 
     def __init__(
         self, bus: FeetechBus, guide: Guide, joints: Sequence[Joint], *, measured: Sequence[Joint],
-        compared: Sequence[str], torque: float = TORQUE, asks: bool = True, signs: bool = False,
+        compared: Sequence[str], zero_at: str = "pose", torque: float = TORQUE, asks: bool = True, signs: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
         self._bus, self._guide, self._joints, self._clock = bus, guide, list(joints), clock
-        self._measured, self._compared = list(measured), compared
+        self._measured, self._compared, self._zero_at = list(measured), compared, zero_at
         self._torque, self._asks, self._signs = torque, asks, signs
         self._ids = [joint.servo for joint in joints]
         self._limit = round(1000 * torque)
@@ -423,8 +424,10 @@ class StopFinder:
         low = yield from self._stop(joint, Way.DOWN)
         high = yield from self._stop(joint, Way.UP)
         between = self._ranges[servo] = Range(low, low, high)
-        if joint.name in self._compared and (fault := misfit(joint, between, self._torque)):
-            raise CalibrationError(fault)
+        if joint.name in self._compared:
+            fault = misfit(joint, between, self._torque) or doubtful(joint, between, self._zero_at)
+            if fault:
+                raise CalibrationError(fault)
         for each in (joint, *stance):
             yield from self._moved(each, MIDDLE_TICK)
 
