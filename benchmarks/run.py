@@ -246,6 +246,13 @@ CLAIMS = (
         "preflight.py --unchanged 60 --each 1",
     ),
     Claim(
+        "identify",
+        "from five minutes of a simulated arm with planted parameters, `ibrobot identify` finds its delay, and of each"
+        " joint the gain, the damping and the motion that is lost on a reversal within 10 %",
+        "docs/how-to/simulate-your-arm.md",
+        "identify.py",
+    ),
+    Claim(
         "server_kill",
         "the arm holds while its server is dead, and continues within 1 s of the restart",
         "docs/how-to/serve.md",

@@ -66,9 +66,6 @@ class RigCheck(Component):
                     "ROBOT --take FILE`, and name it in `against`"
                 )
             return
-        if self._session.request.lockstep:
-            self._session.log.info("preflight: simulated time has not begun; nothing is compared")
-            return
         try:
             self._compare()
         except Refused:
@@ -85,7 +82,7 @@ class RigCheck(Component):
 
         session = self._session
         card = reference_of(self._against) if self._against is not None else None
-        window = self._watched()
+        window = self._looked() if session.request.lockstep else self._watched()
         if self._takes is not None:
             self._takes.parent.mkdir(parents=True, exist_ok=True)
             make_card([window.window]).write(self._takes)
@@ -98,6 +95,13 @@ class RigCheck(Component):
         if result.verdict == "fail" and self._options.action == "refuse":
             worst = result.findings[0]
             raise Refused(f"{worst.evidence.text} {worst.cause.remedy}")
+
+    def _looked(self) -> Any:
+        """A window on another simulation with the same seed: time does not pass in a run in lockstep that starts."""
+        from ibrobot_diagnose.live import look
+
+        request = self._session.request
+        return look(self._session.config, self._options.seconds, lockstep=True, seed=request.seed)
 
     def _watched(self) -> Any:
         """A window on the run, which does not move yet."""

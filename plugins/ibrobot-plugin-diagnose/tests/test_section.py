@@ -99,6 +99,9 @@ def test_run_of_a_rig_that_differs_is_refused_or_warned_of(reference):
     warned = launch(told, *MOVED)
     assert warned.returncode == 0
     assert "W preflight: FAIL  camera_moved: The camera top has moved" in warned.stderr
+    stepped = launch({**told, "action": "refuse"}, *MOVED, "--lockstep")
+    assert stepped.returncode == 1
+    assert "error: preflight: The camera top has moved" in stepped.stderr
     off = launch({**told, "action": "off"}, *MOVED)
     assert (off.returncode, "camera_moved" in off.stderr) == (0, False)
 
