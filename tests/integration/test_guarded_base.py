@@ -179,6 +179,8 @@ def test_the_pose_is_the_sum_of_ways() -> None:
 BASES: list[tuple[Mapping[str, Any], str]] = [
     ({"footprint": [[0, 0], [1, 0]]}, r"base\.footprint: must be three corners or more"),
     ({"footprint": [[0, 0], [1, 0], [2, 0]]}, r"base\.footprint: the corners .* lie on a line"),
+    ({"footprint": [[-10, 0], [10, 0], [0, 2e-7]]}, r"base\.footprint: the corners .* lie on a line, within 1 mm"),
+    ({"footprint": FOOTPRINT, "top": 1e-9}, r"base: bottom \(0\) must be below top \(1e-09\), by 1 mm at least"),
     ({"footprint": [[0, 0], [1, 0], [0, 250]]}, r"base\.footprint: must be .* within 10 m"),
     ({"footprint": [[0, 0], [1, 0], [0, float("nan")]]}, r"base\.footprint: must be"),
     ({"footprint": FOOTPRINT, "top": 0.0}, r"base: bottom \(0\) must be below top \(0\)"),

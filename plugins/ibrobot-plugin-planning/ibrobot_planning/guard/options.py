@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,14 +18,20 @@ if TYPE_CHECKING:
 BASE = "base"
 """The name of a base in messages."""
 _LARGEST_BASE_M = 10.0
+_THINNEST_M = 1e-3
+"""Coal ends the process when it makes the hull of a body whose thickness is lost in rounding."""
 
 
 def _corners(instance: object, attribute: attrs.Attribute[Any], value: tuple[tuple[float, float], ...]) -> None:
     if len(value) < 3 or not all(abs(number) <= _LARGEST_BASE_M for corner in value for number in corner):
         raise ValueError(f"must be three corners or more, each x and y within {_LARGEST_BASE_M:g} m, got {list(value)}")
-    (x, y), *others = value
-    if not any(abs((a - x) * (d - y) - (c - x) * (b - y)) > 1e-6 for (a, b), (c, d) in combinations(others, 2)):
-        raise ValueError(f"the corners {list(value)} lie on a line")
+    first, *others = value
+    for second, third in combinations(others, 2):
+        longest = max(math.dist(first, second), math.dist(second, third), math.dist(third, first))
+        (x, y), (a, b), (c, d) = first, second, third
+        if abs((a - x) * (d - y) - (c - x) * (b - y)) > _THINNEST_M * longest:
+            return
+    raise ValueError(f"the corners {list(value)} lie on a line, within {1e3 * _THINNEST_M:g} mm")
 
 
 @documented
@@ -46,8 +53,10 @@ class BaseOptions:
     theta: str = option("theta", help="joint that turns, counterclockwise")
 
     def __attrs_post_init__(self) -> None:
-        if not self.bottom < self.top:
-            raise ValueError(f"bottom ({self.bottom:g}) must be below top ({self.top:g})")
+        if not self.top - self.bottom >= _THINNEST_M:
+            raise ValueError(
+                f"bottom ({self.bottom:g}) must be below top ({self.top:g}), by {1e3 * _THINNEST_M:g} mm at least"
+            )
 
 
 @documented
