@@ -423,8 +423,8 @@ def test_clouds_of_20000_cells_that_move_are_kept_off(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("_policy")
 def test_every_change_is_known_within_two_ticks(tmp_path: Path) -> None:
     told = Told(tmp_path)
-    box = {"shape": "box", "size": [0.02] * 3}
-    changes = {
+    box: dict[str, Any] = {"shape": "box", "size": [0.02] * 3}
+    changes: dict[str, Message] = {
         "add": told.add(**box), "replace": told.add(**{**box, "position": [0.6, 0.6, 0.6]}), "move": told.move(),
         "touch": partial(told.call, "/world/touch", {"objects": ["it"]}),
         "allow": partial(told.call, "/world/allow", {"name": "it", "may_touch": ["wall"]}),

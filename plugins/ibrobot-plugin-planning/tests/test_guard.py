@@ -682,8 +682,7 @@ def test_a_world_that_is_deleted_in_motion_and_comes_back(tmp_path, at: int, del
 def flickering(kind: str, rng: np.random.Generator, number: int) -> WorldObject:
     """A wall, of which every other time a layer in front is seen in part, or that is measured to be thicker."""
     if kind == "box":
-        wall = WALL["wall"]
-        return attrs.evolve(wall, shape=Box((0.4, 0.02 + 0.002 * (number % 2), 0.3)))
+        return attrs.evolve(WALL["wall"], shape=Box((0.4, 0.02 + 0.002 * (number % 2), 0.3)))
     wall = np.array(list(itertools.product(range(15, 45), (-1, 0), range(30))))
     front = np.array(list(itertools.product(range(15, 45), (1,), range(30))))
     seen = rng.random(len(front)) < 0.3 * (number % 2)
