@@ -33,8 +33,8 @@ AGENT_LOG = "/agent/log"
 """std_msgs/msg/String: JSON with what agents ask for, who grants it, and how it ends."""
 MOVING = ("/planning/go_to", "/move_action", "/task/step", "/task/run")
 """What a person grants by default, of what a run serves."""
-_MOST_REQUEST = 2_000
-"""Longest request in the log, in characters."""
+_MOST_REQUEST, _MOST_SHOWN = 2_000, 300
+"""Longest request in the log, and in the terminal, where it could hide the rest of the panel, in characters."""
 _NOTES_PER_S, _NOTES = 0.2, 50.0
 """Events of the log that move nothing and give nothing, e.g. refused calls and stops: on average, and at once."""
 _TOLERANCE = 1e-3
@@ -363,7 +363,7 @@ class Authority:
             if self._left_out:
                 entry["left_out"], self._left_out = dict(self._left_out), Counter()
         self._session.bus.publish(AGENT_LOG, String(json.dumps(entry, default=str)))
-        shown = " ".join(f"{key}={value}" for key, value in entry.items() if key not in ("stamp_ns", "event", "agent"))
-        self._session.log.info("agent %s: %s %s", agent.name, event, shown)
+        cut = {key: " ".join(str(value).split())[:_MOST_SHOWN] for key, value in facts.items()}
+        self._session.log.info("agent %s: %s %s", agent.name, event, " ".join(f"{key}={cut[key]}" for key in cut))
         for call in self.told:
             call(entry)

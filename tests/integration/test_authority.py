@@ -504,6 +504,18 @@ def test_log_says_who_granted_and_what_was_asked_for(run: AgentRun) -> None:
     assert [each["agent"] for each in events] == ["1:claude"] * 4
 
 
+def test_log_in_the_terminal_is_short_and_on_one_line(run: AgentRun, caplog: pytest.LogCaptureFixture) -> None:
+    """A panel shows the newest message in full: a long one would hide the rest, or look like its rows."""
+    caplog.set_level("INFO", run.session.log.name)
+    with pytest.raises(IbrobotError):
+        run.go("home" + " " * 80 + "grant     1 s" + "x" * 900)
+    (shown,) = [each.getMessage() for each in caplog.records if " refused " in each.getMessage()]
+    assert shown.startswith('agent 1:claude: refused service=/planning/go_to request="home grant 1 sxx')
+    assert "ask a person to grant it" in shown
+    assert len(shown) < 800
+    assert len(run.events()[-1]["request"]) > 900
+
+
 def test_unknown_services_are_named(run: AgentRun) -> None:
     with pytest.raises(TransportError, match="nobody serves /nothing"):
         run.authority.call(run.agent, "/nothing")

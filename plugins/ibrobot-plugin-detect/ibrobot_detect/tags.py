@@ -72,11 +72,19 @@ class TagDetector(Detector):
             )
         best: dict[str, tuple[float, Detection]] = {}
         for sight in sights if wanted else ():
+            here: dict[str, Any] = {}
             for tag_seen in self._tags(sight):
                 name_of, tag = self._objects[tag_seen.tag_id]
                 margin = float(tag_seen.decision_margin)
                 if name_of not in wanted or margin < self._options.margin:
                     continue
+                if name_of in here:  # nobody knows which one is on the object
+                    (x, y), (other_x, other_y) = here[name_of].center, tag_seen.center
+                    raise SensorError(
+                        f"camera {sight.camera} sees tag {tag.id} of {name_of!r} twice, at {x:.0f}, {y:.0f} and "
+                        f"{other_x:.0f}, {other_y:.0f} px: remove or cover the one that is not on the object"
+                    )
+                here[name_of] = tag_seen
                 detection = _placed(sight, name_of, tag, tag_seen)
                 seen = best[name_of][1].seen if name_of in best else ()
                 if name_of not in best or margin > best[name_of][0]:

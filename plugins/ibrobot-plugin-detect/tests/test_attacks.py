@@ -20,7 +20,7 @@ from ibrobot_testing import make_session
 from ibrobot_core.api import Pose, Quaternion, SensorError, Vector3
 
 from .hostile_pictures import attack, names
-from .pictures import camera
+from .pictures import camera, facing, photograph
 
 
 def test_what_is_hostile_gets_an_answer_or_an_error_with_the_reason() -> None:
@@ -37,6 +37,24 @@ def test_pictures_that_are_too_small_for_a_tag_show_none(size: tuple[int, int]) 
     sight = attrs.evolve(camera(np.eye(4)), size=size, pixels=pixels)
     detector = TagDetector(TagOptions({"cube": Tag(id=3, size=0.04)}), make_session())
     assert detector.find("", [sight]) == []
+
+
+def test_a_tag_that_a_camera_sees_twice_is_refused_since_one_may_be_a_copy() -> None:
+    """A copy, e.g. printed on a poster, or in a mirror, would get the pose of the original, or take its place."""
+    sight = camera(np.eye(4))
+    tags = {"cube": Tag(id=3, size=0.04), "bin": Tag(id=11, size=0.04)}
+    left, right = (photograph(sight, {3: (facing(0.2, 0.1, 0.3, (x, 0.0, 0.5)), 0.04)}) for x in (-0.1, 0.1))
+    assert left.pixels is not None
+    assert right.pixels is not None
+    middle = left.size[0] // 2
+    both = attrs.evolve(sight, pixels=np.concatenate([left.pixels[:, :middle], right.pixels[:, middle:]], axis=1))
+    detector = TagDetector(TagOptions(tags), make_session())
+    assert [each.name for each in detector.find("", [left])] == ["cube"]
+    twice = r"camera top sees tag 3 of 'cube' twice, at \d+, \d+ and \d+, \d+ px: remove or cover the one"
+    for name in ("cube", ""):
+        with pytest.raises(SensorError, match=twice):
+            detector.find(name, [both])
+    assert detector.find("bin", [both]) == []
 
 
 def test_texts_choose_names_among_hostile_ones() -> None:

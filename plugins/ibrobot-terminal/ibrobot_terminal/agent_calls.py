@@ -14,6 +14,8 @@ from ibrobot_core.app import Authority, RunView, error_text
 
 _LONGEST = 300
 """Longest request of an agent that is shown, in characters."""
+_REASON = 200
+"""Longest reason why there is no path, in characters."""
 _STILL_RAD = 0.01
 """A joint that moves by less is left out [rad]."""
 _JOINTS = 3
@@ -81,7 +83,8 @@ class AgentCalls:
 
 
 def _shown(request: str) -> str:
-    """A request as far as it is shown: a person must see that there is more."""
+    """A request as far as it is shown: a person must see that there is more. Spaces in it fill no line."""
+    request = " ".join(request.split())
     left = len(request) - _LONGEST
     return request if left <= 0 else f"{request[:_LONGEST]} … and {left} characters more"
 
@@ -121,13 +124,19 @@ def planned_path(session: RunView, asked: AgentCall) -> AskedPath:
     try:
         return path_of(session, session.bus.call(*asked.plan))
     except Exception as error:  # noqa: BLE001 - contained: what an agent asks for must not end the run
-        return AskedPath(0.0, f"none: {error_text(error)}")
+        return _none(error_text(error))
+
+
+def _none(why: str) -> AskedPath:
+    """No path. The reason may quote the agent: short and in ASCII, it looks like no other row of the panel."""
+    words = " ".join(why.split()).encode("ascii", "backslashreplace").decode()
+    return AskedPath(0.0, f"none: {words if len(words) <= _REASON else f'{words[:_REASON]} …'}")
 
 
 def path_of(session: RunView, answer: Any) -> AskedPath:
     """The path in the answer of a service that plans."""
     if answer.trajectory is None:
-        return AskedPath(0.0, f"none: {answer.message}")
+        return _none(answer.message)
     names, points = answer.trajectory.joint_names, answer.trajectory.points
     begin, end = (dict(zip(names, each.positions.tolist(), strict=True)) for each in (points[0], points[-1]))
     moved = [

@@ -285,6 +285,21 @@ def test_long_requests_are_cut_and_cannot_look_like_rows(rig: Rig) -> None:
     assert len(rig.rows()["request"]) < 130
 
 
+@pytest.mark.parametrize("filler", [" ", "\n", "\u00a0", "\u2800", "\u3164", "\u2003"])
+@pytest.mark.parametrize("raised", [True, False])
+def test_reason_without_a_path_that_quotes_the_agent_cannot_look_like_a_row(
+    rig: Rig, filler: str, raised: bool
+) -> None:
+    words = f"no pose '{filler * 70}grant     1 s, 1%, nothing' {'x' * 900}"
+    rig.answer = IbrobotError(words) if raised else SimpleNamespace(trajectory=None, message=words)
+    rig.ask(rig.authority.join("claude"))
+    path = rig.rows()["path"]
+    assert path.startswith("none: no pose '")
+    assert path.removesuffix(" …").isascii()
+    assert "   " not in path
+    assert len(path) < 220
+
+
 def test_keys_that_move_the_robot_grant_nothing(rig: Rig) -> None:
     device = SimpleNamespace(options=SimpleNamespace(terminal_keys=lambda robot: {"Y": "pan+", "w": "lift+"}))
     config = attrs.evolve(rig.session.config, teleoperation={"keyboard": device})
