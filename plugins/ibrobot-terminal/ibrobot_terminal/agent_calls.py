@@ -83,7 +83,7 @@ class AgentCalls:
 
 
 def _shown(request: str) -> str:
-    """A request as far as it is shown: a person must see that there is more. Spaces in it fill no line."""
+    """A request as far as it is shown: a person must see what is left out. Spaces in it fill no line."""
     request = " ".join(request.split())
     left = len(request) - _LONGEST
     return request if left <= 0 else f"{request[:_LONGEST]} … and {left} characters more"
