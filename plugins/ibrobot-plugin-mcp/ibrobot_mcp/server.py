@@ -160,14 +160,15 @@ class AgentServer:
         self.protocol.middleware.append(self._heard)
 
     async def ping(self) -> None:
-        """Ask the clients for signs of life, until it is cancelled.
+        """Ask the agent that may move the robot for signs of life, until it is cancelled; no other one delays it.
 
         Those of the protocol of 2026-07 cannot be asked; their requests are their signs of life.
         """
         while True:
             await asyncio.sleep(_PING_S)
-            if self._authority.status().armed:
-                await asyncio.gather(*(self._ping(each) for each in tuple(self._clients.values())))
+            armed = self._authority.status().armed
+            for client in [each for each in self._clients.values() if each.agent.name == armed]:
+                await self._ping(client)
 
     async def _ping(self, client: Client) -> None:
         if client.session is None:

@@ -13,7 +13,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from ibrobot_mcp.server import PIPES, has_failed, key_of
+from ibrobot_mcp.server import PIPES, Allowance, has_failed, key_of
+from ibrobot_mcp.server import Client as Connected
 from mcp import Client, MCPError
 from mcp.server.auth.middleware.bearer_auth import AuthenticatedUser
 from mcp.server.auth.provider import AccessToken
@@ -418,3 +419,32 @@ def test_agent_that_leaves_blocks_nobody(rig: Rig, mode: str) -> None:
     rig.talk(talk, mode)
     assert answers
     assert rig.authority.status().armed == ""
+
+
+def test_agent_that_answers_no_ping_takes_nothing_from_the_one_that_may_move(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a short lease, the grant of the other one would end while its answer is awaited."""
+    monkeypatch.setattr("ibrobot_mcp.server._PING_S", 0.0)
+    pings: list[str] = []
+
+    def client(name: str, answers: bool) -> Connected:
+        async def send_ping() -> None:
+            pings.append(name)
+            if not answers:
+                await asyncio.Event().wait()
+
+        session = SimpleNamespace(send_ping=send_ping)
+        return Connected(rig.authority.join(name), Allowance(0.0), session=session)
+
+    rig.server._clients = {"first": client("good", answers=True), "second": client("silent", answers=False)}
+    rig.grant(agent="1:good", lease=1.0)
+
+    async def pinged() -> None:
+        asking = asyncio.create_task(rig.server.ping())
+        while len(pings) < 5:
+            await asyncio.sleep(0)
+        asking.cancel()
+
+    asyncio.run(pinged())
+    assert pings == ["good"] * 5
