@@ -9,13 +9,13 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import hostile_agents
 import pytest
+import silenced_agents
 from ibrobot_mcp.door import AgentDoor
 from ibrobot_mcp.resources import Resources
 from ibrobot_mcp.stdio import Pipes
@@ -35,6 +35,10 @@ def test_hostile_agents_move_nothing_beyond_their_grants_and_memory_stays_flat()
     run = hostile_agents.attacked(2_000, seed=0, on_part=memory.append)
     calls = sum(count for outcome, count in run.calls.items() if not outcome.startswith("person"))
     assert calls == 2_000
+    assert +run.broken == {}
+    assert max(run.stop_ticks) <= 10, "a stop by an agent is one within 100 ms"
+    assert run.orders_obeyed > 50
+    assert {"look", "find", "explain", "check_dataset", "evaluate", "record_episode", "run_policy"} <= set(run.tools)
     assert run.calls["moves"] > 20
     assert run.moved > 1.0, "they are granted motion, too"
     assert run.calls["refused"] > 500
@@ -149,53 +153,6 @@ def test_arm_holds_when_its_agent_is_frozen_and_stays_so_when_it_thaws(watched: 
     assert run.pan == at
 
 
-class Relay:
-    """Passes bytes between an agent and a server, until it is cut."""
-
-    def __init__(self, port: int) -> None:
-        self._port = port
-        self.cut = threading.Event()
-        self._started = threading.Event()
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()))
-        self._thread.start()
-        self._started.wait(PATIENCE_S)
-
-    async def _serve(self) -> None:
-        self._loop, self._end = asyncio.get_running_loop(), asyncio.Event()
-        server = await asyncio.start_server(self._relay, "127.0.0.1", 0)
-        self.port = server.sockets[0].getsockname()[1]
-        self._tasks: set[asyncio.Task[None]] = set()
-        self._writers: list[asyncio.StreamWriter] = []
-        self._started.set()
-        await self._end.wait()
-        tasks = tuple(self._tasks)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        for writer in self._writers:
-            writer.close()
-        await asyncio.gather(*(writer.wait_closed() for writer in self._writers), return_exceptions=True)
-        server.close()
-
-    async def _relay(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        far_reader, far_writer = await asyncio.open_connection("127.0.0.1", self._port)
-        self._writers += [writer, far_writer]
-        for source, sink in ((reader, far_writer), (far_reader, writer)):
-            task = asyncio.create_task(self._pass(source, sink))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
-
-    async def _pass(self, source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
-        while data := await source.read(4096):
-            if not self.cut.is_set():  # what is cut neither arrives nor ends
-                sink.write(data)
-        sink.close()
-
-    def close(self) -> None:
-        self._loop.call_soon_threadsafe(self._end.set)
-        self._thread.join()
-
-
 @pytest.mark.parametrize("mode", ["auto", "legacy"])
 def test_arm_holds_when_its_agent_is_out_of_reach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str) -> None:
     import httpx2
@@ -217,7 +174,7 @@ def test_arm_holds_when_its_agent_is_out_of_reach(tmp_path: Path, monkeypatch: p
     door = next(each for each in runtime.plan.components if isinstance(each, AgentDoor))
     runtime.start()
     token = add_token("claude")
-    relay = Relay(int(door.url.split(":")[2].split("/")[0]))
+    relay = silenced_agents.Relay(int(door.url.split(":")[2].split("/")[0]))
 
     async def talk() -> None:
         url = f"http://127.0.0.1:{relay.port}/mcp"
@@ -254,6 +211,19 @@ def test_arm_holds_when_its_agent_is_out_of_reach(tmp_path: Path, monkeypatch: p
     finally:
         relay.close()
         runtime.stop()
+
+
+@pytest.mark.parametrize(
+    ("moment", "way"), [("policy", "freeze"), ("gripper", "kill"), ("recording", "partition"), ("task", "freeze")]
+)
+def test_arm_holds_whatever_its_agent_was_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str, way: str
+) -> None:
+    """`python tests/shared/silenced_agents.py 3` has all moments and ways."""
+    for variable in ("XDG_RUNTIME_DIR", "XDG_STATE_HOME", "XDG_CONFIG_HOME"):
+        monkeypatch.setenv(variable, str(tmp_path))
+    with silenced_agents.SilencedRun(tmp_path / "episodes") as run:
+        assert run.silence(moment, way) == "holds"
 
 
 UPRIGHT = [3.14159, 0.0, 0.0]
