@@ -7,13 +7,13 @@ operator's takeover, silence of the agent, and anybody who wishes end it; the ar
 from __future__ import annotations
 
 import itertools
-import json
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from contextvars import ContextVar
 from functools import partial
+from json import dumps
 from typing import Any
 
 import attrs
@@ -218,7 +218,7 @@ class Authority:
         """
         self.renew(agent)
         service = self._session.bus.services().get(name)
-        facts = {"service": name, "request": json.dumps(request, default=str)[:_MOST_REQUEST]}
+        facts = {"service": name, "request": dumps(request, default=str)[:_MOST_REQUEST]}
         grant: Grant | None = None
         token = ACTING.set(agent)
         try:
@@ -362,7 +362,8 @@ class Authority:
             self._room -= not kept
             if self._left_out:
                 entry["left_out"], self._left_out = dict(self._left_out), Counter()
-        self._session.bus.publish(AGENT_LOG, String(json.dumps(entry, default=str)))
+        # Episodes that begin later have who granted what, too.
+        self._session.bus.publish(AGENT_LOG, String(dumps(entry, default=str)), latched=event in ("armed", "ended"))
         cut = {key: " ".join(str(value).split())[:_MOST_SHOWN] for key, value in facts.items()}
         self._session.log.info("agent %s: %s %s", agent.name, event, " ".join(f"{key}={cut[key]}" for key in cut))
         for call in self.told:

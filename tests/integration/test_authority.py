@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import closing, suppress
 from contextvars import Context
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pytest
 
-from ibrobot_core.api import Header, JointState, MoveJoint
+from ibrobot_core.api import Header, JointState, MoveJoint, String
 from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
 from ibrobot_core.contract.specs import joint_selection
 from ibrobot_core.control.commands import LimitSpeed
@@ -27,12 +28,12 @@ AWAY, HERE = "shoulder_pan=1.2", "shoulder_pan=0"
 class AgentRun:
     """A run in lockstep with an agent, whose client gives signs of life at each tick, unless it is `frozen`."""
 
-    def __init__(self, scene: str = "empty", *more: str) -> None:
+    def __init__(self, scene: str = "empty", *more: str, request: Mapping[str, Any] = MappingProxyType({})) -> None:
         overrides = (f"simulation.scene={{type: {scene}}}", *more)
         config = load_config(
             CONFIG, sim=True, mode="moveit_planning", overrides=overrides, registry=installed_plugins()
         )
-        self.runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True)))
+        self.runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, **request)))
         self.session = self.runtime.session
         self.authority = self.session.authority
         self.commands: list[np.ndarray] = []
@@ -80,6 +81,34 @@ def run() -> Iterator[AgentRun]:
     made = AgentRun()
     yield made
     made.close()
+
+
+def test_recorded_episode_has_who_granted_what_before_it_began(tmp_path: Path) -> None:
+    """`/agent/log` of a bag begins with the grant, or with how the last one ended."""
+    run = AgentRun("empty", f"recording={{type: mcap, root: {tmp_path}, dataset: seen}}", request={"by_operator": True})
+    bus = run.session.bus
+    run.grant(by="a person")
+    run.go("shoulder_pan=0.1")
+    run.ticks(5)
+    bus.call("/record_episode/start", "pan")
+    run.ticks(5)
+    run.go("shoulder_pan=0.2")
+    run.ticks(30)
+    bus.call("/record_episode/stop", "success")
+    run.ticks(5)
+    bus.call(DISARM)
+    bus.call("/record_episode/start", "rest")
+    run.ticks(10)
+    bus.call("/record_episode/stop", "success")
+    run.close()
+    recorded = []
+    for number in (1, 2):
+        path = tmp_path / f"seen/episodes/episode_{number:06}"
+        with closing(installed_plugins().open_episode(path)) as episode:
+            messages = [each.message for each in episode.messages([AGENT_LOG])]
+        entries = [json.loads(each.data) for each in messages if isinstance(each, String)]
+        recorded.append([(each["event"], each.get("grant", {}).get("by", "")) for each in entries])
+    assert recorded == [[("armed", "a person"), ("called", "")], [("ended", "")]]
 
 
 @pytest.fixture
