@@ -170,5 +170,4 @@ class Lines(RunDisplay):
         self.sample()
         if time.monotonic() >= self._next_s:
             self._next_s += _PLAIN_PERIOD_S
-            line = self.line()
-            echo(f"{line} | {more}" if (more := self._hooks.line()) else line, err=self._err)
+            echo(" | ".join(filter(None, (self.line(), self._hooks.line()))), err=self._err)

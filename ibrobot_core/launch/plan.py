@@ -74,16 +74,16 @@ class LaunchPlan:
         return [*lines, *without, *unavailable_modes(self.unavailable), "stops in reverse order"]
 
 
-def mode_components(session: Session, name: str, link: TransportLink | None) -> ModeComponents:
-    """The components of a mode, without loading anything."""
+def mode_components(session: Session, name: str, link: TransportLink | None, prompt: str = "") -> ModeComponents:
+    """The components of a mode, without loading anything; `prompt` replaces that of the robot YAML for its policy."""
     mode = session.config.control_modes[name]
     if session.request.source is not None and name == session.config.default_control_mode:
         return ModeComponents((), session.request.source(session, mode))
-    if mode.inference is not None:
-        model = LoadedModel(session, mode.inference, link)
+    if (inference := mode.inference) is not None:
+        model = LoadedModel(session, inference, link)
         needs = (CONTROL, *(f"sensor:{sensor.name}" for sensor in _sensors(session)))
-        policy = PolicySource(session, mode, mode.inference, model, needs)
-        if mode.inference.intervene is None:
+        policy = PolicySource(session, mode, attrs.evolve(inference, prompt=prompt or inference.prompt), model, needs)
+        if inference.intervene is None:
             return ModeComponents((model,), policy)
         return ModeComponents((model,), session.registry.create("source", "intervene", session, mode, policy), policy)
     if mode.teleop is not None:

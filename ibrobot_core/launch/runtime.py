@@ -32,6 +32,7 @@ class SetMode:
     """A request to `/set_mode`."""
 
     mode: str = option(help="a control mode of the robot YAML")
+    prompt: str = option("", help="task of the mode's policy, in place of that of the robot YAML")
     stops: int | None = option(None, ge=0, help="number of emergency stops that the sender knew of; none: all so far")
 
 
@@ -130,7 +131,7 @@ class Runtime:
             if ended and isinstance(error, ComponentFailed):
                 return
             raise
-        session.bus.serve(SET_MODE, lambda request: self.switch_mode(request.mode, request.stops))
+        session.bus.serve(SET_MODE, lambda request: self.switch_mode(request.mode, request.stops, request.prompt))
         session.bus.serve(RESET, lambda request: self.reset(request.stops))
 
     def wait(self, timeout_s: float) -> bool:
@@ -154,15 +155,16 @@ class Runtime:
                 session.fail(component.name, error)
         return self.wait(0.0)
 
-    def switch_mode(self, name: str, stops: int | None = None) -> None:
+    def switch_mode(self, name: str, stops: int | None = None, prompt: str = "") -> None:
         """Enter another mode: start its components, then change the owner of the joints within one tick.
 
-        For the present mode, continue it if a reset made the robot hold; otherwise do nothing. A request waits for a
-        mode switch or reset under way.
+        For the present mode, continue it if a reset made the robot hold; otherwise do nothing, unless its policy is
+        given another prompt. A request waits for a mode switch or reset under way.
 
         Args:
             name: the mode.
             stops: as for `reset`.
+            prompt: task of the mode's policy; empty: that of the robot YAML.
 
         Raises:
             IbrobotError: if there is no such mode, its components do not start, or the robot is stopped, now or
@@ -175,17 +177,17 @@ class Runtime:
             raise PluginError(f"mode {name} is unavailable: {reason}")
         if session.faults:
             raise HardwareError(f"mode {name}: refused before a reset: {session.faults[-1]}")
-        policy = name != session.mode and session.config.control_modes[name].inference is not None
+        policy = session.config.control_modes[name].inference is not None and (name != session.mode or prompt != "")
         with self._changing(f"mode {name}", session.stops if stops is None else stops, policy):
-            if name != session.mode:
-                self._enter(name)
+            if prompt or name != session.mode:
+                self._enter(name, prompt)
             elif session.held:
                 self._go_on()
 
-    def _enter(self, name: str) -> None:
+    def _enter(self, name: str, prompt: str) -> None:
         """Enter another mode."""
         session = self.session
-        added = mode_components(session, name, self.plan.link)
+        added = mode_components(session, name, self.plan.link, prompt)
         new = added.components()
         try:
             for component in new:

@@ -9,7 +9,7 @@ import attrs
 import pytest
 
 from ibrobot_core.errors import ComponentFailed, ConfigError
-from ibrobot_core.messages import DiagnosticArray, RobotStatus
+from ibrobot_core.messages import MODEL_ANSWERS, DiagnosticArray, ModelAnswer, RobotStatus
 
 if TYPE_CHECKING:
     from fake_runs import Runs
@@ -38,6 +38,38 @@ def test_a_prompt_is_there_where_the_policy_wants_one(
     caplog.clear()
     runs.start(prompt).stop()
     assert "takes no prompt" not in caplog.text
+
+
+def test_policy_mode_is_entered_with_another_prompt(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    runs.start().stop()
+    make = runs.parts.Net.__init__
+
+    def wants_a_prompt(self: Any, *arguments: Any, **options: Any) -> None:
+        make(self, *arguments, **options)
+        self.spec = attrs.evolve(self.spec, prompt=True)
+
+    monkeypatch.setattr(runs.parts.Net, "__init__", wants_a_prompt)
+    runtime = runs.start("control_modes.policy.inference.prompt=pick", "contract.max_duration_s=100", seed=13)
+    bus = runtime.session.bus
+    answers = bus.subscribe(MODEL_ANSWERS, 100)
+
+    def prompts() -> set[str]:
+        answers.drain()
+        for _ in range(40):
+            runtime.step()
+        return {each.message.prompt for each in answers.drain() if isinstance(each.message, ModelAnswer)}
+
+    assert prompts() == {"pick"}
+    bus.call("/set_mode", {"mode": "policy", "prompt": "put it down"})
+    assert prompts() == {"put it down"}
+    bus.call("/set_mode", "policy")
+    assert prompts() == {"put it down"}, "the mode just goes on"
+    for request, expected in (("policy", "pick"), ({"mode": "policy", "prompt": "push"}, "push")):
+        bus.call("/set_mode", "idle")
+        bus.call("/set_mode", request)
+        assert prompts() == {expected}
+    answers.close()
+    runtime.raise_failure()
 
 
 def test_the_status_and_the_diagnostics_tell_how_the_plan_is_kept_filled(runs: Runs):

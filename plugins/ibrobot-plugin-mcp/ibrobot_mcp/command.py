@@ -14,6 +14,8 @@ TASKS = "tasks"
 """A section that serves tasks and their steps, which agents use, if a package offers it."""
 DETECT = "detect"
 """A section that finds objects, likewise."""
+WORLD = "world"
+"""A section that has the objects of a scene, likewise: an agent names them in goals."""
 
 
 @attrs.frozen(kw_only=True)
@@ -37,6 +39,8 @@ class RunMcp(ModeOptions):
         more = [f"{SECTION}={{http: false}}"] if SECTION not in robot.plugin_sections else []
         wanted = {DETECT, *([TASKS] if mode is not None else [])}
         more += [f"{each}={{}}" for each in sorted(wanted & known - set(robot.plugin_sections))]
+        if robot.simulated and mode is not None and WORLD in known - set(robot.plugin_sections):
+            more.append(f"{WORLD}={{scene: true}}")
         robot = self.load(mode, (*self.changes(), *more))
         pipes = take_standard_pipes() if not self.dry_run else None
 

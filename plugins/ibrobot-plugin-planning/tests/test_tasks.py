@@ -18,7 +18,7 @@ from ibrobot_planning.world.objects import SNAPSHOT
 from ibrobot_testing import SectionSuite
 
 from ibrobot_core.api import IbrobotError, PlanningError, String
-from ibrobot_core.app import ConfigError, RequestError, Runtime
+from ibrobot_core.app import SET_MODE, ConfigError, RequestError, Runtime
 
 from .conftest import Make
 from .test_motion import RATE_HZ, robot_yaml
@@ -251,6 +251,16 @@ def test_policy_runs_for_its_time_and_the_planner_takes_over_again(run):
     assert result.success, result.message
     assert result.steps[0].duration_s == pytest.approx(0.5, abs=0.1)
     assert runtime.session.mode == "plan"
+
+
+@pytest.mark.parametrize("prompt", ["", "pick up the cube"])
+def test_policy_is_given_the_prompt_of_the_step(run, prompt: str):
+    runtime = run()
+    given = []
+    runtime.session.bus.unserve(SET_MODE)
+    runtime.session.bus.serve(SET_MODE, lambda request: given.append(request) or runtime.switch_mode(request.mode))
+    perform(runtime, steps(f"run_policy: {{mode: policy, seconds: 0.1, prompt: {prompt!r}}}"))
+    assert [(each.mode, each.prompt) for each in given] == [("policy", prompt), ("plan", "")]
 
 
 def test_policy_without_success_fails_the_step(run):

@@ -107,6 +107,7 @@ class PolicyStep:
     until: Literal["time", "success"] = option(
         "time", help="success: ends when the scene is solved, and fails if that takes longer than `seconds`"
     )
+    prompt: str = option("", help="the policy's task, in place of that of the mode, if it takes one")
 
 
 @documented

@@ -174,9 +174,9 @@ class Performance:
         if self._session.stops != self._stops:  # it was reset between two polls
             raise StepFailed("the robot stopped: an emergency stop")
 
-    def _enter(self, mode: str) -> None:
+    def _enter(self, mode: str, prompt: str = "") -> None:
         if self._session.mode != mode:
-            self._session.bus.call(SET_MODE, SetMode(mode))
+            self._session.bus.call(SET_MODE, SetMode(mode, prompt))
 
     # Steps.
 
@@ -311,7 +311,7 @@ class Performance:
 
     def _policy(self, step: PolicyStep) -> Steps:
         session, episode, self._episode = self._session, self._episode, None
-        self._enter(step.mode)
+        self._enter(step.mode, step.prompt)
         begun_ns = session.clock.now_ns()
         solved, recorded, outcome = False, False, "unknown"
         try:
