@@ -1,6 +1,7 @@
 // The page without a running robot: header, navigation, and one view at a time.
 
 import { clearToasts, h, refresh, say, switchTheme, toast } from "./dom.js";
+import { titled } from "./ui/job.js";
 import { words } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
@@ -162,8 +163,8 @@ function showConnection(why = "not connected: is ibrobot ui running?") {
 function showRunning() {
   const running = [...ui.jobs.values()].filter((job) => job.state === "running");
   refresh($("busy"), running.map((job) => [job.number, job.facts.url]), () => running.map((job) => (job.facts.url
-    ? h("a", { class: "chip good", href: ui.runAddress(job.facts.url), target: "_blank" }, `${job.title}: open its page`)
-    : h("a", { class: "chip good", href: "#jobs" }, job.title))));
+    ? h("a", { class: "chip good", href: ui.runAddress(job.facts.url), target: "_blank" }, `${titled(job.title)}: open its page`)
+    : h("a", { class: "chip good", href: "#jobs" }, titled(job.title)))));
 }
 
 $("theme").addEventListener("click", switchTheme);

@@ -11,7 +11,7 @@ export const RUNS = ["run", "record"];
 const STATES = { running: "running", done: "done", failed: "failed", cancelled: "ended" };
 
 // The title of a job begins with what the page calls its command; then it names files.
-function titled(title) {
+export function titled(title) {
   const shown = words(title);
   return shown === title ? title.replace(/^\S+/, (name) => words(name)) : shown;
 }
@@ -81,7 +81,7 @@ export class JobCard {
     this.plot.setAttribute("aria-label", words(`${axes[1]} over ${axes[0]}`));
     drawPlot(this.plot, {
       times: points.map(([x]) => x), lines: [[axes[1], points.map(([, y]) => y)]], begin: 0, end,
-      labels: [`${axes[1]}, ${axes[0]} 0`, String(Math.round(end))],
+      labels: [`${words(axes[1])}, ${words(axes[0])} 0`, String(Math.round(end))],
     });
   }
 
