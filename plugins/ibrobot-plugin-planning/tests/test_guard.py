@@ -16,6 +16,7 @@ from typing import Any
 import attrs
 import mujoco
 import numpy as np
+import pinocchio
 import pytest
 from ibrobot_planning.guard.changes import WorldChange
 from ibrobot_planning.guard.clearance_guard import ClearanceGuard
@@ -736,6 +737,38 @@ def test_an_object_that_trembles_is_not_come_nearer_to(tmp_path, trembles_m: flo
         loop.guard.world(WorldChange({}, moved={"wall": pose}).message())
         loop.tick(ACROSS)
     assert seen.distance(loop.position) > 0.001
+
+
+def test_an_object_that_is_named_like_the_table_does_not_take_its_place(tmp_path) -> None:
+    loop = Loop(tmp_path, np.array([0.0, 0.3, 0.3, 0.2, 0.0, 0.3]), floor=0.0, may_touch={"floor": ("base", "turret")})
+    loop.world({"floor": box(0.9, 0.9, 0.9, 0.01, 0.01, 0.01)})
+    down_to = loop.go(np.array([0.0, 1.8, 1.2, 0.6, 0.0, 0.0]))
+    assert Seen({}, floor=True).distance(down_to) > MARGIN_M - 0.001
+    loop.world(dict(POSTS, floor=WALL["wall"]))
+    loop.go(LEFT)
+    assert Seen(WALL).distance(loop.go(ACROSS)) > MARGIN_M - 0.001, "and counts"
+
+
+def test_from_a_crowd_a_slow_motion_leads_out(tmp_path) -> None:
+    """However many things are near: some that come no nearer are known to do so by where the motion ends."""
+    start, up = np.array([0.0, 0.9, 0.6, 0.3, 0.0, 0.2]), np.array([0.0, 0.0, 0.6, 0.3, 0.0, 0.2])
+    loop, rng = Loop(tmp_path, start), np.random.default_rng(1)
+    arm = loop.guard._arm
+    data = arm.model.createData()
+    pinocchio.forwardKinematics(arm.model, data, arm.native(start))
+    lower = next(shape for shape in arm.shapes if shape.link == "lower")
+    placed = data.oMi[lower.joint].homogeneous @ lower.placement
+    along, across = placed[:3, 2], np.array([0.0, 1.0, 0.0])
+    below = -np.abs(np.cross(along, across)) * (-np.sign(along[2]), 1.0, 1.0)
+    crowd = {}
+    for number in range(150):
+        place = placed[:3, 3] + rng.uniform(-0.05, 0.05) * along + rng.uniform(-0.01, 0.01) * across + 0.013 * below
+        crowd[f"bead {number}"] = box(*place, 0.004, 0.004, 0.004)
+    loop.world(crowd)
+    for number in range(701):
+        loop.tick(start + (number / 700) ** 2 * (up - start))
+    assert np.abs(loop.go(up, 60) - up).max() < 0.01
+    assert loop.guard.counts["pairs"] > 600
 
 
 class TestFeed:

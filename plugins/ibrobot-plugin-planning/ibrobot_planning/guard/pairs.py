@@ -277,11 +277,14 @@ class Pairs:
         last = len(path) - 1
         steps = np.diff(path, axis=0)
         turns_back = bool(((steps > 0).any(axis=0) & (steps < 0).any(axis=0)).any())
-        for at in (last, 1):  # where the motion ends, since most that is blocked is blocked there; and the next command
-            near = self.distances(path[at], pairs) < required
-            if near.any():
-                return pairs[near]
-        todo = [(0.0, float(last), pairs, required)]
+        # Where the motion ends, since most that is blocked is blocked there; and the next command.
+        for at in dict.fromkeys((last, 1)):
+            apart = self.distances(path[at], pairs) - required
+            if (apart < 0).any():
+                return pairs[apart < 0]
+            if at == last:  # slow motions need no more, however many pairs are near: so an arm gets out of any crowd
+                left = apart + BETWEEN_M < self.levers[pairs] @ np.abs(path - path[last]).max(axis=0)
+        todo = [(0.0, float(last), pairs[left], required[left])] if left.any() else []
         while todo:
             begin, end, among, needed = todo.pop()
             if self.left <= 0:

@@ -17,6 +17,8 @@ from ibrobot_planning.world.arm import Arm, Pair, sorted_pair
 from ibrobot_planning.world.coal_shapes import enclosing, geometry
 from ibrobot_planning.world.objects import FLOOR, Boxes, Mesh, Plane, Voxels, World, WorldObject
 
+_OTHER_FLOOR = f"{FLOOR} of the world"
+"""An object that is named like the table, beside it: it does not take its place."""
 _ROUNDING_M = 1e-6
 """How far an object in a region may reach beyond it [m]."""
 _CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
@@ -51,20 +53,23 @@ class Permissions:
             floor = None
         self._fixed = {} if floor is None else {FLOOR: WorldObject(Plane(), Pose(Vector3(0.0, 0.0, floor)))}
         may_touch = {FLOOR: self._hands} if options.may_touch is None else options.may_touch
+        if FLOOR in may_touch:
+            may_touch = {**may_touch, _OTHER_FLOOR: may_touch[FLOOR]}
         self.pressed: Mapping[Pair, float] = {
             sorted_pair(name, other): options.press for name, others in may_touch.items() for other in others
         }
 
     def applied(self, world: World) -> World:
         """A world with the table, and with what may be touched without limit."""
-        objects = {**self._fixed, **world.objects}
+        others = {_OTHER_FLOOR if name in self._fixed else name: thing for name, thing in world.objects.items()}
+        objects = {**self._fixed, **others}
         return World({name: thing for given in objects.items() for name, thing in self._permitted(*given)})
 
     def _permitted(self, name: str, thing: WorldObject) -> Iterator[tuple[str, WorldObject]]:
         """An object with what may touch it; cells that lie in a region are an object of their own."""
         free = self._options.free
         if free is not None:
-            thing = _touchable(thing, free.get(name, ()))
+            thing = _touchable(thing, free.get(FLOOR if name == _OTHER_FLOOR else name, ()))
         elif thing.movable:
             thing = _touchable(thing, self._hands)
         for region, box in self._options.regions.items() if thing.link is None else ():
