@@ -75,6 +75,6 @@ class Context:
         """
         simulation, source = (config.simulation.options, str(config.source)) if config.simulation else (None, "")
         robot: Robot = more.get("robot", config.robot)
-        given = {"robot": robot, "joints": robot.joint_names, "simulation": simulation, "source": source}
+        given = {"robot": robot, "joints": robot.joint_names, "simulation": simulation, "source": source, **more}
         log, period_ns = logging.getLogger(f"ibrobot.{name}"), ns(1.0 / config.control.rate_hz)
-        return cls(name=name, clock=clock, log=log, period_ns=period_ns, seed=seed, **given | more)
+        return cls(name=name, clock=clock, log=log, period_ns=period_ns, seed=seed, **given)
