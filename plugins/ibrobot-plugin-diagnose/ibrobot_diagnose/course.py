@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any
@@ -18,6 +19,8 @@ type Flags = NDArray[np.bool_]
 
 AT_LIMIT = 0.97
 """Share of a velocity limit from which a command counts as limited."""
+CONFLICT = 0.06
+"""Difference between answers for the same time from which they are not the same [rad]."""
 _MOVED = 0.05
 """An arm has begun to move when a command is so far from the first one [rad]."""
 
@@ -166,8 +169,13 @@ def conflict_of(course: Course) -> Floats:
     return np.where(count > 1, nearest, 0.0)
 
 
-def changes_of(window: Window) -> float:
-    """How a change from answer to answer, for the same times, agrees with the next one: -1 to and fro, 1 alike."""
+def chance_of_noise(window: Window) -> float:
+    """Chance that answers which err around one intention change to and fro for the same times as these do.
+
+    Of two intentions, each change beyond `CONFLICT` takes back the one before, along the direction in which answers
+    change most. Of noise around one, two in three do; of a drift, few. So this is the chance of at least so many in as
+    many trials; 1 without any.
+    """
     used = [each for each in window.asked if each.used and each.answer.joint_names == window.joints]
     changes = []
     for one, other in itertools.pairwise(used):
@@ -175,11 +183,13 @@ def changes_of(window: Window) -> float:
         if len(times) > 1:
             moved = _at(other.times_ns, other.chunk, times, 1) - _at(one.times_ns, one.chunk, times, 1)
             changes.append(np.nanmedian(moved, axis=0))
-    if len(changes) < 4:
-        return -1.0
+    if len(changes) < 2:
+        return 1.0
     rows = np.nan_to_num(np.array(changes))
-    size = float((rows**2).sum(axis=1).mean())
-    return float((rows[1:] * rows[:-1]).sum(axis=1).mean()) / size if size > 0 else 0.0
+    along = rows @ np.linalg.svd(rows, full_matrices=False)[2][0]
+    signs = np.sign(along[np.abs(along) > CONFLICT])
+    count, back = max(0, len(signs) - 1), int((signs[1:] != signs[:-1]).sum())
+    return sum(math.comb(count, each) * 2**each for each in range(back, count + 1)) / 3**count
 
 
 def _at(own_ns: Times, values: Floats, t_ns: Times, step_ns: int) -> Floats:

@@ -19,10 +19,11 @@ from ibrobot_diagnose.card import make_card
 from ibrobot_diagnose.cause import KIND, OWN_NAMES, Cause, CauseDescriptor, Evidence, Reference
 from ibrobot_diagnose.causes import all_causes
 from ibrobot_diagnose.causes.data import UnseenStates
-from ibrobot_diagnose.causes.motion import AnswersTremble
+from ibrobot_diagnose.causes.motion import AnswersTremble, SmoothingAverages
 from ibrobot_diagnose.commands import check
 from ibrobot_diagnose.diagnosis import diagnose
 from ibrobot_diagnose.report import Explanation
+from ibrobot_diagnose.testing import Answer, make_window
 from made_runs import Run, window_of
 from numpy.typing import NDArray
 from planted_faults import JOINTS, PICTURES, TIMES, of_top
@@ -105,6 +106,34 @@ def test_each_cause_says_what_to_do():
         assert cause.remedy.endswith("."), cause.name
         assert cause.title[0].islower(), cause.name
         assert cause.explains <= {each.name for each in all_causes()} | {"camera_ignored"}, cause.name
+
+
+@pytest.mark.parametrize(
+    ("offsets", "named"),
+    [
+        ([0.3, -0.3] * 8, True),
+        ([0.3, 0.3, -0.3, -0.3, 0.3, -0.3, -0.3] * 3, True),
+        ([0.4, -0.4, 0.4, 0.1] + [0.1] * 12, False),
+        ([0.1 * each for each in range(16)], False),
+    ],
+    ids=["in turn", "now one, now the other", "a few times at the beginning", "a drift"],
+)
+def test_only_answers_of_two_intentions_are_averaged(offsets, named):
+    """Whatever one large change among them does, and however large the share that is torn."""
+    times = np.arange(10 * len(offsets) + 40) / 30
+    path = np.stack([np.sin(times), np.cos(times)], axis=1)
+    answers = [
+        Answer(10 * i, path[10 * i : 10 * i + 40] + np.array([off, 0.0]), latency=0.02) for i, off in enumerate(offsets)
+    ]
+    window = make_window(path, path, answers=answers)
+    first = diagnose(window, Reference(), [SmoothingAverages()]).first
+    assert first == ("smoothing_averages" if named else "")
+
+
+def test_arm_that_does_not_follow_comes_before_the_guard_that_then_holds_it():
+    """The guard holds commands back, and an arm without a fault follows those."""
+    window = window_of(Run(seed=9302, cameras=(), gain={0: 0.5}, guarded=(0.5, 0.8)))
+    assert [each.name for each in diagnose(window, Reference()).findings] == ["arm_not_following", "guard_held"]
 
 
 def test_gripper_that_holds_something_is_no_fault():

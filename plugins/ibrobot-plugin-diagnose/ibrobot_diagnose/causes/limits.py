@@ -78,7 +78,7 @@ class GuardHeld(Cause):
     name = "guard_held"
     title = "the guard let the arm go where it was sent"
     needs = frozenset({"guard", "commands"})
-    explains = frozenset({"arm_not_following", "limits_low", "stands_still"})
+    explains = frozenset({"limits_low", "stands_still"})
     remedy = (
         "Move what is in the way, or correct its place and size in the section `world`. If the arm is meant to touch "
         "it, say so: `movable` or `may_touch` of the object, or `may_touch`, `free` and `regions` of `control.guard`."

@@ -7,7 +7,7 @@ from typing import override
 import numpy as np
 
 from ibrobot_diagnose.cause import Cause, Evidence, Reference, likelihood
-from ibrobot_diagnose.course import begins_to_move, changes_of, conflict_of, course_of, delay_of
+from ibrobot_diagnose.course import CONFLICT, begins_to_move, chance_of_noise, conflict_of, course_of, delay_of
 from ibrobot_diagnose.window import Floats, Window
 
 
@@ -16,6 +16,7 @@ class ArmNotFollowing(Cause):
 
     name = "arm_not_following"
     title = "the arm follows its commands"
+    explains = frozenset({"guard_held"})  # not the other way: the guard holds commands back, and the arm follows these
     needs = frozenset({"commands", "state"})
     remedy = (
         "Look at this joint: something in its way, a load, a loose horn, a low supply voltage, a gain that is too "
@@ -85,7 +86,7 @@ class SmoothingAverages(Cause):
         if course is None or not course.acting.any():
             return None
         conflict = conflict_of(course)[course.acting]
-        torn = conflict > 0.06
+        torn = conflict > CONFLICT
         share = float(torn.mean())
         if not torn.any():
             return None
@@ -94,9 +95,13 @@ class SmoothingAverages(Cause):
             "every answer that it blends: they disagree, and their mean is none of them."
         )
         since = window.since(int(course.times_ns[course.acting][torn.argmax()]))
-        # Answers that drift one way are those of a policy that errs; those of two intentions go to and fro.
-        likely = likelihood(share, 0.15, 0.4) * (1.0 if changes_of(window) < -0.2 else 0.4)
+        # Answers that drift one way, or a few times make up for a change, are those of a policy that errs.
+        likely = likelihood(share, 0.15, 0.4) * (1.0 if chance_of_noise(window) < _CHANCE else 0.4)
         return Evidence(text, 100 * share, "%", 15.0, likely, since)
+
+
+_CHANCE = 0.1
+"""Chance below which answers that go to and fro are not those of one intention; see `chance_of_noise`."""
 
 
 class StandsStill(Cause):
@@ -135,7 +140,10 @@ class AnswersTremble(Cause):
     title = "the model's answers are motions"
     weak = True
     needs = frozenset({"chunks"})
-    explains = frozenset({"other_speed", "limits_low", "smoothing_averages", "unseen_states", "arm_not_following"})
+    explains = frozenset({
+        "other_speed", "limits_low", "smoothing_averages", "unseen_states", "arm_not_following",
+        "guard_held",  # such answers lead into the table
+    })  # fmt: skip
     remedy = (
         "Train longer, on more data; for a diffusion policy look at its denoising steps, too. Nothing of the robot "
         "makes answers like these."
