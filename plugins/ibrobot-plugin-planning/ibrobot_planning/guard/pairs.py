@@ -284,7 +284,9 @@ class Pairs:
                 return pairs[apart < 0]
             if at == last:  # slow motions need no more, however many pairs are near: so an arm gets out of any crowd
                 left = apart + BETWEEN_M < self.levers[pairs] @ np.abs(path - path[last]).max(axis=0)
-        todo = [(0.0, float(last), pairs[left], required[left])] if left.any() else []
+        todo: list[tuple[float, float, Indices, Vector]] = []
+        if left.any():
+            todo.append((0.0, float(last), pairs[left], required[left]))
         while todo:
             begin, end, among, needed = todo.pop()
             if self.left <= 0:
