@@ -274,9 +274,7 @@ class Declined(IbrobotError):
         super().__init__("stopped: the answer was no")
 
 
-_OF_THE_MACHINE = frozenset(
-    {errno.ENOSPC, errno.EDQUOT, errno.ENOMEM, errno.EMFILE, errno.ENFILE, errno.EFBIG, errno.EIO}
-)
+_OF_THE_MACHINE = {errno.ENOSPC, errno.EDQUOT, errno.ENOMEM, errno.EMFILE, errno.ENFILE, errno.EFBIG, errno.EIO}
 
 
 @contextmanager

@@ -20,14 +20,7 @@ from ibrobot_core.options import OptionFault
 from ibrobot_core.plugins import example_type
 from ibrobot_core.robot import Robot
 from ibrobot_core.run_hooks import RUN_KEYS, check_key
-from ibrobot_core.schema import (
-    ControlConfig,
-    ControlMode,
-    ExecutorConfig,
-    HardwareConfig,
-    InferenceConfig,
-    devices_of,
-)
+from ibrobot_core.schema import ControlConfig, ControlMode, ExecutorConfig, HardwareConfig, InferenceConfig, devices_of
 
 
 @attrs.frozen

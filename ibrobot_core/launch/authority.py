@@ -33,8 +33,9 @@ AGENT_LOG = "/agent/log"
 """std_msgs/msg/String: JSON with what agents ask for, who grants it, and how it ends."""
 MOVING = ("/planning/go_to", "/move_action", "/task/step", "/task/run")
 """What a person grants by default, of what a run serves."""
-_MOST_REQUEST, _MOST_SHOWN = 2_000, 300
-"""Longest request in the log, and in the terminal, where it could hide the rest of the panel, in characters."""
+_MOST_KEPT, _MOST_REQUEST, _MOST_SHOWN = 20_000, 2_000, 300
+"""Longest text in the log of what may have moved the robot and of the rest, and in the terminal, where it could hide
+the rest of the panel, in characters."""
 _NOTES_PER_S, _NOTES = 0.2, 50.0
 """Events of the log that move nothing and give nothing, e.g. refused calls and stops: on average, and at once."""
 _TOLERANCE = 1e-3
@@ -131,8 +132,8 @@ class Authority:
         self.told: list[Callable[[Mapping[str, Any]], object]] = []
         """Called with each event of the log, which others cannot forge, as they can messages on a topic."""
         self._noting = threading.Lock()
-        self._room, self._noted_ns = _NOTES, session.clock.now_ns()
-        """How many events of those that are bounded may come at once, at that time."""
+        self._room: dict[str, tuple[float, int]] = {}
+        """Name of an agent, the same in each connection -> how many bounded events of it may come at once, and when."""
         self._left_out: Counter[str] = Counter()
         """Events that had no room since the last one of the log."""
         self.speed = 1.0
@@ -218,7 +219,7 @@ class Authority:
         """
         self.renew(agent)
         service = self._session.bus.services().get(name)
-        facts = {"service": name, "request": dumps(request, default=str)[:_MOST_REQUEST]}
+        facts = {"service": name, "request": dumps(request, default=str)}
         grant: Grant | None = None
         token = ACTING.set(agent)
         try:
@@ -235,7 +236,7 @@ class Authority:
                 raise HardwareError(f"{name}: the authority ended during the call: {self._ended}")
         except Exception as error:
             began = grant is not None and not isinstance(error, RequestError)
-            self._note("refused", agent, kept=began, **facts, why=str(error)[:_MOST_REQUEST])
+            self._note("refused", agent, kept=began, **facts, why=str(error))
             raise
         finally:
             ACTING.reset(token)
@@ -352,19 +353,27 @@ class Authority:
 
         What may have moved the robot is `kept` whatever comes. Others are left out in a flood, and counted.
         """
-        entry = {"stamp_ns": self._session.clock.now_ns(), "event": event, "agent": agent.name, **facts}
+        most = _MOST_KEPT if kept else _MOST_REQUEST
+        texts = {key: _cut(value, most) if isinstance(value, str) else value for key, value in facts.items()}
+        now_ns, name = self._session.clock.now_ns(), agent.name.partition(":")[2]
+        entry = {"stamp_ns": now_ns, "event": event, "agent": agent.name, **texts}
         with self._noting:
-            gained = seconds(entry["stamp_ns"] - self._noted_ns) * _NOTES_PER_S
-            self._room, self._noted_ns = min(_NOTES, self._room + gained), entry["stamp_ns"]
-            if not kept and self._room < 1.0:
+            room, noted_ns = self._room.get(name, (_NOTES, 0))
+            room = min(_NOTES, room + seconds(now_ns - noted_ns) * _NOTES_PER_S)
+            self._room[name] = room - (not kept and room >= 1.0), now_ns
+            if not kept and room < 1.0:
                 self._left_out[event] += 1
                 return
-            self._room -= not kept
             if self._left_out:
                 entry["left_out"], self._left_out = dict(self._left_out), Counter()
         # Episodes that begin later have who granted what, too.
         self._session.bus.publish(AGENT_LOG, String(dumps(entry, default=str)), latched=event in ("armed", "ended"))
-        cut = {key: " ".join(str(value).split())[:_MOST_SHOWN] for key, value in facts.items()}
-        self._session.log.info("agent %s: %s %s", agent.name, event, " ".join(f"{key}={cut[key]}" for key in cut))
+        shown = " ".join(f"{key}={_cut(' '.join(str(value).split()), _MOST_SHOWN)}" for key, value in facts.items())
+        self._session.log.info("agent %s: %s %s", agent.name, event, shown)
         for call in self.told:
             call(entry)
+
+
+def _cut(text: str, most: int) -> str:
+    """The beginning of a text, which says how much is missing."""
+    return text if len(text) <= most else f"{text[:most]}… and {len(text) - most} characters more"

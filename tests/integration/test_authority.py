@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import closing, suppress
 from contextvars import Context
@@ -585,6 +586,27 @@ def test_log_has_all_that_moved_though_a_flood_comes_between(run: AgentRun) -> N
             run.authority.call(other, GO_TO, AWAY)
     called = [each["request"] for each in run.events() if each["event"] == "called"]
     assert called == [f'"shoulder_pan=0.{number:03}"' for number in range(300)]
+
+
+def test_flood_of_one_agent_hides_no_request_of_another(run: AgentRun) -> None:
+    for number in range(100):
+        with pytest.raises(HardwareError, match="ask a person"):
+            run.go(f"shoulder_pan=0.{number:03}")
+    other = run.authority.join("other")
+    with pytest.raises(HardwareError, match="ask a person"):
+        run.go("shoulder_pan=0.5", other)
+    assert [each["agent"] for each in run.events()][-2:] == ["2:other", "2:other"]
+
+
+def test_log_has_long_requests_that_moved_whole_and_says_what_others_lack(task_run: AgentRun) -> None:
+    task = "# " + "x" * 9_000 + "\nsteps:\n- move: {pose: rest}\n"
+    with pytest.raises(HardwareError):
+        task_run.authority.call(task_run.agent, "/task/run", {"task": task})
+    task_run.grant(services=("/task/run",))
+    task_run.authority.call(task_run.agent, "/task/run", {"task": task})
+    refused, called = (each for each in task_run.events() if each["event"] in ("refused", "called"))
+    assert json.loads(called["request"]) == {"task": task}
+    assert re.search(r"x… and 7\d\d\d characters more$", refused["request"])
 
 
 def test_what_is_left_out_last_is_said_at_the_end(run: AgentRun) -> None:

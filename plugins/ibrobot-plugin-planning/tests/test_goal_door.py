@@ -62,6 +62,15 @@ def test_padding_and_floor_of_the_section_goals(start: Make, tmp_path: Path):
         runtime.session.send_goal("arm", "down", to(0.0, 1.7, 0.0, 0.0, 0.0, at=4.0))
 
 
+def test_object_of_its_name_does_not_take_the_place_of_the_floor(start: Make, tmp_path: Path):
+    crumb = "{shape: box, size: [0.01, 0.01, 0.01], position: [3, 3, 3]}"
+    text = robot_yaml(tmp_path) + f"goals: {{floor: 0.04}}\nworld: {{objects: {{floor: {crumb}}}}}\n"
+    runtime = start(text=text, mode="idle")
+    runtime.step()
+    with pytest.raises(PlanningError, match="floor of the planner"):
+        runtime.session.send_goal("arm", "down", to(0.0, 1.7, 0.0, 0.0, 0.0, at=4.0))
+
+
 def test_executor_that_is_not_active_gets_no_goal(start: Make, tmp_path: Path):
     text = robot_yaml(tmp_path).replace("  idle: {executors: [arm]}", "  idle: {executors: [gripper]}")
     runtime = start(text=text, mode="idle")

@@ -108,14 +108,18 @@ class AgentKeys:
     def _is_read(self, asked: AgentCall) -> bool:
         """Whether a person has had the time to read the request, which is then answered; a key that repeats has not."""
         now_s = time.monotonic()
-        if now_s < self._read_s:
+        if now_s < self._read_s or not self._is_planned(asked):
             self._read_s = now_s + _READ_S
             return False
         self._answered = asked.number
         return True
 
+    def _is_planned(self, asked: AgentCall) -> bool:
+        """Whether the panel shows the path that is asked for, or why there is none."""
+        return self._path is not None and self._path[0] == asked and self._path[1].done()
+
     def _too_soon(self) -> None:
-        self._session.log.warning("%s came too soon: read what the agent asks for, and press it again", ALLOW)
+        self._session.log.warning("%s came too soon: read the request and its path, and press it again", ALLOW)
 
     def _refuse(self) -> None:
         """Refuse what is asked for, and take back what is granted: an agent that goes on asking keeps none of it."""
@@ -153,7 +157,7 @@ class AgentKeys:
         another = self._path is None or (self._path[0] != asked and self._path[1].done())
         if another and time.monotonic() >= self._plan_s:
             self._path = asked, self._paths.submit(self._planned, asked)
-        if self._path is None or self._path[0] != asked or not self._path[1].done():
+        if self._path is None or not self._is_planned(asked):
             return "is being planned"
         return self._path[1].result().at(speed)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any, cast
@@ -103,6 +104,27 @@ def test_run_without_a_door_for_agents_shows_nothing(rig: Rig) -> None:
     assert not any(map(rig.press, "YNTV"))
     rig.authority.open()
     assert rig.rows() == {}
+
+
+def test_person_allows_nothing_whose_path_is_not_shown_yet(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = rig.authority.join("claude")
+    goes_on = threading.Event()
+    planned = agent_keys.planned_path
+
+    def slowly(*given: Any) -> Any:
+        goes_on.wait(60)
+        return planned(*given)
+
+    monkeypatch.setattr(agent_keys, "planned_path", slowly)
+    rig.ask(agent)
+    assert dict(rig.keys.rows())["path"] == "is being planned"
+    rig.now_s += 2.0
+    assert rig.press("Y")
+    assert rig.authority.status().armed == ""
+    goes_on.set()
+    assert rig.read()["path"] == "up to 2.0 s; pan 0.00 to 0.40 [rad]"
+    assert rig.press("Y")
+    assert rig.authority.status().armed == "1:claude"
 
 
 def test_person_sees_who_asks_for_what_and_the_path_and_allows_it(rig: Rig) -> None:

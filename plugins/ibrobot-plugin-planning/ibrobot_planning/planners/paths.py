@@ -70,9 +70,13 @@ class FreePaths:
         """The present world, with the floor."""
         world = world_of(self._bus, self._world)
         floor = self._floor if margins.floor is None else margins.floor
-        if floor is None or FLOOR in world.objects:
+        named = world.objects.get(FLOOR)
+        if floor is None or (named is not None and isinstance(named.shape, Plane)):
             return world
-        return world.add(FLOOR, WorldObject(Plane(), Pose(Vector3(0.0, 0.0, floor))))
+        # Another object of this name does not take the table's place.
+        return world.add(
+            FLOOR if named is None else f"{FLOOR} of the planner", WorldObject(Plane(), Pose(Vector3(0.0, 0.0, floor)))
+        )
 
     def note(self, trajectory: JointTrajectory, world: World) -> None:
         """Remember that a trajectory, or all of it that is still new, is free in a world."""
