@@ -189,7 +189,7 @@ def chance_of_noise(window: Window) -> float:
     along = rows @ np.linalg.svd(rows, full_matrices=False)[2][0]
     signs = np.sign(along[np.abs(along) > CONFLICT])
     count, back = max(0, len(signs) - 1), int((signs[1:] != signs[:-1]).sum())
-    return sum(math.comb(count, each) * 2**each for each in range(back, count + 1)) / 3**count
+    return float(sum(math.comb(count, each) * 2**each for each in range(back, count + 1)) / 3**count)
 
 
 def _at(own_ns: Times, values: Floats, t_ns: Times, step_ns: int) -> Floats:
