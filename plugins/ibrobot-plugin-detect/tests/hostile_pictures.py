@@ -115,11 +115,13 @@ class Made:
         if kind < 0.6 and min(width, height) > 0:
             file = io.BytesIO()
             Pillow.fromarray(self.pixels(width, height)).save(file, self.random.choice(["JPEG", "PNG"]))
-            data = bytearray(file.getvalue())
+            damaged = bytearray(file.getvalue())
             for _ in range(self.random.choice([0, 0, 1, 20])):
-                data[self.random.randrange(len(data))] = self.random.randrange(256)
-            data = data[: self.random.choice([len(data), len(data), self.random.randrange(len(data))])]
-            return CompressedImage(header, self.random.choice(FORMATS), np.frombuffer(bytes(data), np.uint8))
+                damaged[self.random.randrange(len(damaged))] = self.random.randrange(256)
+            length = self.random.choice([len(damaged), len(damaged), self.random.randrange(len(damaged))])
+            return CompressedImage(
+                header, self.random.choice(FORMATS), np.frombuffer(bytes(damaged[:length]), np.uint8)
+            )
         data = np.frombuffer(self.random.randbytes(self.random.choice([0, 1, 7, 3 * width * height, 20_000])), np.uint8)
         if kind < 0.7:
             return CompressedImage(header, self.random.choice(FORMATS), data)
@@ -163,7 +165,7 @@ class Made:
 
     def world(self) -> list[SceneObject]:
         """Objects with odd names and sizes."""
-        shapes = ("box", "sphere", "cylinder", "capsule", "plane", self.text())
+        shapes: Any = ("box", "sphere", "cylinder", "capsule", "plane", self.text())
         things = []
         for _ in range(self.random.randrange(20)):
             size = tuple(abs(self.number()) for _ in range(self.random.randrange(4)))

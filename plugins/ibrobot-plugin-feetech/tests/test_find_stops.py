@@ -61,7 +61,8 @@ class Operator(Guide):
     @override
     def wait(
         self, request: str, *, flag: str = "", columns: Sequence[str] = (),
-        rows: Callable[[], Cells] | None = None, seconds: float | None = None,
+        rows: Callable[[], Cells] | None = None, sight: Callable[[], bytes | None] | None = None,
+        seconds: float | None = None,
     ) -> None:  # fmt: skip
         self.said.append(request)
         until_s = Line.now_s + (seconds if seconds is not None else 300.0)

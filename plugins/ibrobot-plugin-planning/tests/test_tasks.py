@@ -258,7 +258,12 @@ def test_policy_is_given_the_prompt_of_the_step(run, prompt: str):
     runtime = run()
     given = []
     runtime.session.bus.unserve(SET_MODE)
-    runtime.session.bus.serve(SET_MODE, lambda request: given.append(request) or runtime.switch_mode(request.mode))
+
+    def switch(request):
+        given.append(request)
+        return runtime.switch_mode(request.mode)
+
+    runtime.session.bus.serve(SET_MODE, switch)
     perform(runtime, steps(f"run_policy: {{mode: policy, seconds: 0.1, prompt: {prompt!r}}}"))
     assert [(each.mode, each.prompt) for each in given] == [("policy", prompt), ("plan", "")]
 

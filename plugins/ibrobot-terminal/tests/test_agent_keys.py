@@ -11,7 +11,7 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_terminal import agent_keys
-from ibrobot_terminal.agent_calls import AgentCalls, path_of
+from ibrobot_terminal.agent_calls import AgentCalls, path_of, planned_path
 from ibrobot_terminal.agent_keys import AgentKeys
 from ibrobot_testing import make_session, stand_in
 
@@ -109,11 +109,10 @@ def test_run_without_a_door_for_agents_shows_nothing(rig: Rig) -> None:
 def test_person_allows_nothing_whose_path_is_not_shown_yet(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     agent = rig.authority.join("claude")
     goes_on = threading.Event()
-    planned = agent_keys.planned_path
 
     def slowly(*given: Any) -> Any:
         goes_on.wait(60)
-        return planned(*given)
+        return planned_path(*given)
 
     monkeypatch.setattr(agent_keys, "planned_path", slowly)
     rig.ask(agent)
@@ -323,7 +322,7 @@ def test_reason_without_a_path_that_quotes_the_agent_cannot_look_like_a_row(
 
 
 def test_keys_that_move_the_robot_grant_nothing(rig: Rig) -> None:
-    device = SimpleNamespace(options=SimpleNamespace(terminal_keys=lambda robot: {"Y": "pan+", "w": "lift+"}))
+    device: Any = SimpleNamespace(options=SimpleNamespace(terminal_keys=lambda robot: {"Y": "pan+", "w": "lift+"}))
     config = attrs.evolve(rig.session.config, teleoperation={"keyboard": device})
     rig.session.config = config
     keys = AgentKeys(rig.session)

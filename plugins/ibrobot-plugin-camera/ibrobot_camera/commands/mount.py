@@ -19,6 +19,7 @@ from ibrobot_camera.mounting.edit import with_transform
 from ibrobot_camera.mounting.episode import Source
 from ibrobot_camera.mounting.fit import Session
 from ibrobot_camera.mounting.solve import Mounting, solve_mount
+from ibrobot_camera.options import OpenCvOptions
 from ibrobot_core.api import CameraInfo, Header, IbrobotError, SensorError, Vector, option
 from ibrobot_core.app import (
     RequestError,
@@ -140,8 +141,9 @@ def _camera(config: RobotConfig, name: str) -> str:
 
 
 def _info(config: RobotConfig, camera: str) -> CameraInfo | None:
-    path = getattr(config.peripherals[camera].options, "info", None)
-    return load_info(path)(Header()) if isinstance(path, Path) else None
+    options = config.peripherals[camera].options
+    path = options.info if isinstance(options, OpenCvOptions) else None
+    return load_info(path)(Header()) if path is not None else None
 
 
 def _write(source: Path, camera: str, link: str, result: Mounting) -> None:
