@@ -246,6 +246,13 @@ CLAIMS = (
         "preflight.py --unchanged 60 --each 1",
     ),
     Claim(
+        "camera_mount",
+        "with 1 pixel of noise and 20 % of wrong pictures, `ibrobot camera mount` finds the mount of a camera in the hand or"
+        " on a stand within 3 mm and 0.5 degrees, or says that it cannot",
+        "docs/how-to/add-a-camera.md",
+        "camera_mount.py",
+    ),
+    Claim(
         "identify",
         "from five minutes of a simulated arm with planted parameters, `ibrobot identify` finds its delay, and of each"
         " joint the gain, the damping and the motion that is lost on a reversal within 10 %",
