@@ -74,13 +74,13 @@ def misfits(
     if abs(span - expected) > TOLERANCE * expected:
         yield (
             f"{joint}: it moved by {_deg(span):.0f} deg, its limits are {_deg(expected):.0f} deg apart, and a "
-            "difference of "
-            f"{100 * TOLERANCE:.0f} % is allowed; check that it was moved to both ends, and that it is the right joint"
+            f"difference of {100 * TOLERANCE:.0f} % is allowed; check that it was moved to both ends, and that it is "
+            "the right joint"
         )
         return
-    middle = abs((lower + upper) / 2) * ticks
     if closed:
         return
+    middle = abs((lower + upper) / 2) * ticks
     if zero_at != "pose":
         if _deg(middle) > OFF_CENTRE_DEG:
             yield (

@@ -323,6 +323,17 @@ def test_motor_that_draws_more_than_its_torque_needs_is_refused(rig, monkeypatch
     rig.refuses("its current is [0-9.]+ A, above 1.62", HardwareError)
 
 
+def test_current_of_a_standing_joint_ends_the_motion_of_another_one(rig, monkeypatch):
+    plain, standing = Mechanics.current_a, rig.mechanics(1)
+
+    def current(self: Mechanics, speed: float, duty: float) -> float:
+        return 2.0 if self is standing and rig.guide.readings >= 60 else plain(self, speed, duty)
+
+    monkeypatch.setattr(Mechanics, "current_a", current)
+    rig.refuses("shoulder_pan.*its current is 2.00 A, above 1.62", HardwareError)
+    assert rig.guide.readings < 65
+
+
 def test_arm_that_moves_by_itself_is_refused(rig):
     servo = rig.emulator.servos[1]
     watch = rig.emulator.on_request

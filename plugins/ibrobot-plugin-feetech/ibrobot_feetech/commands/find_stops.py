@@ -60,6 +60,8 @@ _OTHERS = 170
 """How far a joint that should hold its position may move [ticks]: 15 degrees, since a soft servo sags."""
 _SETTLES_S = 1.0
 """Time in which joints settle after the torque came on."""
+_LONGEST_S = 300.0
+"""Longest time for the stops of one joint, where nobody is asked [s]."""
 _LOST = 5
 """Readings in a row that a servo may miss."""
 _SHORT, _LONG = 0.05, 0.25
@@ -72,6 +74,8 @@ _LOWEST_VOLTAGE = 0.85
 """Share of the first voltage."""
 _STALL_A = 2.7
 """Current of an STS3215 that stands still at full torque [A]."""
+_SURGES = 3
+"""Readings in a row with a greater current than the torque needs, from which the arm is stopped."""
 _NUDGE = 60
 """Small motion that shows a person which joint is which [ticks]."""
 _CLEAR_LOAD = 25
@@ -161,7 +165,8 @@ class StopFinder:
         self._loads: dict[int, list[tuple[int, int, int]]] = {servo: [] for servo in self._ids}
         """Servo -> position, load and direction, while it moves."""
         self._inverted: dict[str, bool] = {}
-        self._over = 0
+        self._over = dict.fromkeys(self._ids, 0)
+        """Servo -> readings in a row with too much current."""
         self._volts: dict[int, float] = {}
         self._begun = False
         self.unrestored: list[str] = []
@@ -312,8 +317,6 @@ class StopFinder:
                 each["present_temperature"], each["present_current"] * 0.0065,
             )  # fmt: skip
             self._check(servo, state)
-        if self._over >= 3:
-            raise HardwareError(self._too_much)
         return bool(replies.answered.all())
 
     def _check(self, servo: int, state: _State) -> None:
@@ -328,13 +331,14 @@ class StopFinder:
             )
         most = 1.5 * self._torque * _STALL_A
         if abs(state.amperes) > most:
-            self._over += 1
-            self._too_much = (
+            self._over[servo] += 1
+        else:
+            self._over[servo] = 0
+        if self._over[servo] >= _SURGES:
+            raise HardwareError(
                 f"{place}: its current is {abs(state.amperes):.2f} A, above {most:.2f} A, which this torque needs at "
                 "most; check whether it is an STS3215, and whether its gears turn freely"
             )
-        elif servo == self._active:
-            self._over = 0
         if servo in self._held and servo != self._active and abs(state.position - self._held[servo]) > _OTHERS:
             raise HardwareError(
                 f"{place}: it moved from {self._held[servo]} to {state.position} ticks, by more than {_OTHERS}, while "
@@ -394,10 +398,9 @@ class StopFinder:
         for joint in self._joints:
             if abs(self._held[joint.servo] - MIDDLE_TICK) > _OTHERS:
                 raise CalibrationError(
-                    f"{joint.name}: it sagged by {_deg(self._held[joint.servo] - MIDDLE_TICK):.0f} deg as the "
-                    "torque came "
-                    f"on, more than {_deg(_OTHERS):.0f}: its weight is more than {100 * self._torque:.0f} % hold, or "
-                    "a person holds it; fold the arm, or give more by --torque"
+                    f"{joint.name}: it sagged by {_deg(self._held[joint.servo] - MIDDLE_TICK):.0f} deg as the torque "
+                    f"came on, more than {_deg(_OTHERS):.0f}: its weight is more than {100 * self._torque:.0f} % hold, "
+                    "or a person holds it; fold the arm, or give more by --torque"
                 )
 
     def _nudge(self, joint: Joint) -> _Steps[None]:
@@ -452,9 +455,8 @@ class StopFinder:
             raise CalibrationError(
                 f"{joint.name}: with {100 * self._torque:.0f} % of the torque it stops at {firm}, with "
                 f"{100 * _GENTLE * self._torque:.0f} % at {gentle}, {abs(firm - gentle)} ticks apart, more than "
-                f"{_SAME}: "
-                "that is no stop but a cable, a hand, stiff gears or the arm's weight; free the joint, or give more by "
-                "--torque"
+                f"{_SAME}: that is no stop but a cable, a hand, stiff gears or the arm's weight; free the joint, or "
+                "give more by --torque"
             )
         return gentle
 
@@ -485,10 +487,9 @@ class StopFinder:
                 return int(np.median(places))
             elif now_s - moved_s > _IDLE_S:
                 raise CalibrationError(
-                    f"{joint.name}: it stands still at {state.position} with a load of {abs(state.load) / 10:.0f} "
-                    "%, and "
-                    f"pushes with less than the {self._limits[servo] / 10:.0f} % it may: servo {servo} does not obey; "
-                    "`ibrobot feetech check` compares its registers"
+                    f"{joint.name}: it stands still at {state.position} with a load of {abs(state.load) / 10:.0f} %, "
+                    f"and pushes with less than the {self._limits[servo] / 10:.0f} % it may: servo {servo} does not "
+                    "obey; `ibrobot feetech check` compares its registers"
                 )
             goal = state.position + sign * _LEASH
             goal = max(_MARGIN, min(TICKS_PER_TURN - 1 - _MARGIN, goal))
@@ -498,9 +499,8 @@ class StopFinder:
                 raise CalibrationError(
                     f"{joint.name}: it turned by {_deg(turned):.0f} deg and met no stop, where its limits are "
                     f"{_deg((joint.upper - joint.lower) * TICKS_PER_RADIAN):.0f} deg apart: a stop is missing, the "
-                    "joint "
-                    "did not begin in the middle of its range, or it is another joint; if it can make a full turn, "
-                    f"give --full-turn {joint.name}"
+                    "joint did not begin in the middle of its range, or it is another joint; if it can make a full "
+                    f"turn, give --full-turn {joint.name}"
                 )
             self._bus.write(servo, "goal_position", goal)
             yield
@@ -538,10 +538,9 @@ class StopFinder:
         if pulls == (-expected if inverted else expected):
             return None
         return (
-            f"{joint.name}: to hold it takes {abs(mean) / 10:.1f} % of the torque, in the direction that its "
-            "weight should "
-            "pull: it is reversed, or the arm does not stand upright; --check-signs asks for the direction of each "
-            "joint"
+            f"{joint.name}: to hold it takes {abs(mean) / 10:.1f} % of the torque, in the direction that its weight "
+            "should pull: it is reversed, or the arm does not stand upright; --check-signs asks for the direction of "
+            "each joint"
         )
 
     def _weight(self, servo: int) -> float | None:
@@ -558,19 +557,14 @@ class StopFinder:
         return mean if abs(mean) >= _CLEAR_LOAD else None
 
 
-_LONGEST_S = 300.0
-"""Longest time for the stops of one joint, where nobody is asked [s]."""
-
-
 def misfit(joint: Joint, between: Range, torque: float) -> str | None:
     """The reason why a range that was found is not that of the joint's limits; None if it can be."""
     expected = (joint.upper - joint.lower) * TICKS_PER_RADIAN
     if between.span < (1 - _SHORT) * expected:
         return (
             f"{joint.name}: between both places where it stops are {_deg(between.span):.0f} deg, its limits are "
-            f"{_deg(expected):.0f} deg apart, and at least {100 * (1 - _SHORT):.0f} % of that must be free: "
-            "something is in "
-            f"its way (a cable, the table, a hand), or {100 * torque:.0f} % of the torque are too little"
+            f"{_deg(expected):.0f} deg apart, and at least {100 * (1 - _SHORT):.0f} % of that must be free: something "
+            f"is in its way (a cable, the table, a hand), or {100 * torque:.0f} % of the torque is too little"
         )
     if between.span > (1 + _LONG) * expected:
         return (

@@ -19,8 +19,6 @@ _LAG_S = 0.02
 _STEP_S = 1e-3
 _STILL = 2.0
 """Slower than this counts as standing still [ticks/s]."""
-
-
 _BEYOND = 0.02
 """Distance from a joint's limit to its stop [of its range]."""
 _WEIGHTS = {"shoulder_lift": 0.19, "elbow_flex": 0.16, "wrist_flex": 0.04}
