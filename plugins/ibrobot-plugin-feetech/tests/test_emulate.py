@@ -95,3 +95,13 @@ def test_nothing_else_moves_what_a_hand_does(other: tuple[str, ...]) -> None:
     ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert ran.returncode == 2
     assert "--swing excludes --physics and --mechanics" in ran.stderr
+
+
+@pytest.mark.parametrize(("cable", "known"), [(0, 6), (3, 2), (7, 6), (8, 6)])
+def test_a_cable_at_no_joint_is_refused(cable: int, known: int) -> None:
+    servos = "2" if known == 2 else "8"
+    options = ("--mechanics", "--servos", servos, "--cable", str(cable), "2500")
+    command = (*ibrobot_command(), "feetech", "emulate", *options)
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert ran.returncode == 2
+    assert f"--cable: servo {cable} has no joint of an SO-101; ids are 1 to {known}" in ran.stderr

@@ -133,8 +133,8 @@ def _add_mechanics(emulator: Emulator, joints: Sequence[str], cables: Mapping[in
     from ibrobot_feetech.emulator.mechanics import mechanics_of
 
     for cable in cables:
-        if cable not in emulator.servos:
-            raise RequestError(f"--cable: there is no servo {cable}; ids are 1 to {len(emulator.servos)}")
+        if not 1 <= cable <= len(joints):
+            raise RequestError(f"--cable: servo {cable} has no joint of an SO-101; ids are 1 to {len(joints)}")
     for (servo, emulated), joint in zip(emulator.servos.items(), joints, strict=False):
         lower, upper = next(ends for name, ends in SO101.items() if joint.endswith(name))
         emulated.mechanics = mechanics_of(joint, lower, upper, MIDDLE_TICK)
