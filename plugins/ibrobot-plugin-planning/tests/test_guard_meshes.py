@@ -84,6 +84,16 @@ def test_boxes_are_not_much_larger_than_the_mesh() -> None:
     assert np.prod(boxes.sizes, axis=1).sum() < 2 * 0.5 * 0.5 * 0.0003
 
 
+def test_triangles_that_rounding_leaves_undivided_share_a_box() -> None:
+    """No number is between the middles of the last two triangles, so that no plane separates them."""
+    alone = np.array([[0.0, 0.0, 0.0], [0.001, 0.0, 0.0], [0.0, 0.001, 0.0]])
+    one = np.array([[1.0, 0.0, 0.0], [1.0, 0.001, 0.0], [1.0, 0.0, 0.001]])
+    other = one + np.array([np.spacing(1.0), 0.0, 0.0])
+    boxes = surrounding(Mesh(np.concatenate([alone, one, other]), np.arange(9).reshape(-1, 3)))
+    assert isinstance(boxes, Boxes)
+    assert len(boxes.sizes) == 2
+
+
 def test_a_body_around_a_convex_mesh_has_few_corners_and_is_hardly_larger() -> None:
     rng = np.random.default_rng(3)
     for stretch in ((1, 1, 1), (1, 1, 0.1), (1, 0.1, 0.1), (1, 0.5, 0.02)):

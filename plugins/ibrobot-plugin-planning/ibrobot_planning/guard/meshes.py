@@ -115,10 +115,11 @@ def _groups(corners: Vector) -> Iterator[_Group]:
     """Neighbouring triangles, of shape (M, 3, 3); the largest group is halved until there are as many as allowed."""
     middles = corners.mean(axis=1)
 
-    def entry(group: _Group, number: int) -> tuple[float, int, _Group]:
-        return -float(np.ptp(middles[group], axis=0).max()), number, group
+    def entry(group: _Group) -> tuple[float, int, _Group]:
+        return -float(np.ptp(middles[group], axis=0).max()), int(group[0]), group
 
-    queue = [entry(np.arange(len(corners)), 0)]
+    # The first triangle, which no other group has, decides between equal sizes: arrays have no order.
+    queue = [entry(np.arange(len(corners)))]
     while len(queue) < _MOST_BOXES and queue[0][0] < 0:
         group = heapq.heappop(queue)[2]
         low, high = middles[group].min(axis=0), middles[group].max(axis=0)
@@ -128,7 +129,7 @@ def _groups(corners: Vector) -> Iterator[_Group]:
             heapq.heappush(queue, (0.0, int(group[0]), group))
             continue
         for half in (group[lower], group[~lower]):
-            heapq.heappush(queue, entry(half, int(half[0]) + 1))
+            heapq.heappush(queue, entry(half))
     for _, _, group in queue:
         yield group
 
