@@ -278,7 +278,7 @@ class Authority:
 
         Args:
             what: what happens, for messages.
-            policy: whether it starts one, which also a task of an agent does only if `/set_mode` is granted.
+            policy: whether it starts a policy, which even a task of an agent may do only if `/set_mode` is granted.
 
         Raises:
             HardwareError: if an agent does it that may not.

@@ -167,8 +167,8 @@ class Runtime:
             prompt: task of the mode's policy; empty: that of the robot YAML.
 
         Raises:
-            IbrobotError: if there is no such mode, its components do not start, or the robot is stopped, now or
-                before this request's turn; the present mode continues.
+            IbrobotError: if there is no such mode, it has no policy for the prompt, its components do not start, or
+                the robot is stopped, now or before this request's turn; the present mode continues.
         """
         session = self.session
         if name not in session.config.control_modes:
@@ -177,7 +177,9 @@ class Runtime:
             raise PluginError(f"mode {name} is unavailable: {reason}")
         if session.faults:
             raise HardwareError(f"mode {name}: refused before a reset: {session.faults[-1]}")
-        policy = session.config.control_modes[name].inference is not None and (name != session.mode or prompt != "")
+        policy = session.config.control_modes[name].inference is not None
+        if prompt and not policy:
+            raise NotSupported(f"mode {name}: takes no prompt, since it has no policy")
         with self._changing(f"mode {name}", session.stops if stops is None else stops, policy):
             if prompt or name != session.mode:
                 self._enter(name, prompt)
@@ -250,7 +252,7 @@ class Runtime:
         Args:
             what: the change, for messages.
             stops: as for `reset`.
-            policy: whether it starts one.
+            policy: whether it starts a policy.
 
         Raises:
             IbrobotError: if the run has ended, or there were more emergency stops, when its turn comes.

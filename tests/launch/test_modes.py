@@ -48,6 +48,14 @@ def test_from_mode_to_mode_and_back(runs: Runs):
     ]
 
 
+def test_a_mode_without_a_policy_refuses_a_prompt(runs: Runs):
+    runtime = runs.start(mode="teleop")
+    for mode in ("teleop", "plan"):
+        with pytest.raises(NotSupported, match=f"mode {mode}: takes no prompt, since it has no policy"):
+            runtime.session.bus.call(SET_MODE, {"mode": mode, "prompt": "pick up the cube"})
+    assert runtime.session.mode == "teleop"
+
+
 def test_new_parts_are_ready_before_ownership_changes_and_old_ones_go_after(
     runs: Runs, monkeypatch: pytest.MonkeyPatch
 ):
