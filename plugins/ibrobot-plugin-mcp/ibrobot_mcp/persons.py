@@ -61,12 +61,12 @@ class Persons:
 
     def __init__(self, session: RunView) -> None:
         self._session = session
-        self._calls = AgentCalls(session)
         self.path = sockets_folder() / f"{session.config.robot.name}.{os.getpid()}"
         self.path.unlink(missing_ok=True)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._socket.bind(str(self.path))
         self._socket.listen(_WAITING)
+        self._calls = AgentCalls(session)
         self._open: set[socket.socket] = set()
         self._answering = ThreadPoolExecutor(_AT_ONCE, "person")
         self._thread = threading.Thread(target=self._serve, name="persons", daemon=True)

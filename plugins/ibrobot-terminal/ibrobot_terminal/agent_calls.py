@@ -68,8 +68,9 @@ class AgentCalls:
         self._authority.told.append(self._take)
 
     def close(self) -> None:
-        """Listen no more."""
-        self._authority.told.remove(self._take)
+        """Listen no more. Safe to call twice."""
+        with suppress(ValueError):
+            self._authority.told.remove(self._take)
 
     def _take(self, entry: Mapping[str, Any]) -> None:
         service = self._session.bus.services().get(entry.get("service", ""))

@@ -354,6 +354,7 @@ def test_calls_are_counted_once_closed_no_more(rig: Rig) -> None:
     assert calls.newest is not None
     assert calls.newest.number == 2
     calls.close()
+    calls.close()
     rig.ask(agent)
     assert calls.newest.number == 2
 
