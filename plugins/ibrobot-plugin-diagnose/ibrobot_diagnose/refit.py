@@ -157,11 +157,11 @@ def turns(sight: Sight) -> str:
     ways = [
         word for way, word in ((right, "right"), (-right, "left"), (down, "down"), (-down, "up")) if way > _LEAST_WAY
     ]
-    turns = [f"turn it {' and '.join(ways)}"] if ways else []
+    actions = [f"turn it {' and '.join(ways)}"] if ways else []
     if abs(roll) > _LEAST_ROLL:
         side = "clockwise" if roll > 0 else "counterclockwise"
-        turns.append(f"roll it {side} by {abs(np.degrees(roll)):.1f}°")
-    return ", ".join(turns) or f"move it until it fits to {WARNS:g} px"
+        actions.append(f"roll it {side} by {abs(np.degrees(roll)):.1f}°")
+    return ", ".join(actions) or f"move it until it fits to {WARNS:g} px"
 
 
 def overlay(then: NDArray[np.uint8], now: NDArray[np.uint8]) -> bytes:

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ibrobot_camera.mounting.closed import scale_of, turns
 from ibrobot_camera.mounting.fit import USUAL, Fit, Session
@@ -50,7 +49,7 @@ def check_count(shots: int, *, measured: bool, seen: str) -> None:
         raise SensorError(f"{shots} pictures can be used, at least {least} are needed{seen}")
 
 
-def check_turns(session: Session, rows: NDArray[np.bool_] | None = None) -> None:
+def check_turns(session: Session) -> None:
     """Check that the arm turns enough, about more than one axis.
 
     Raises:
@@ -58,8 +57,7 @@ def check_turns(session: Session, rows: NDArray[np.bool_] | None = None) -> None
     """
     if session.board is not None:
         return
-    part = session if rows is None else session.some(rows)
-    vectors = np.degrees(turns(part.arm))
+    vectors = np.degrees(turns(session.arm))
     largest = float(np.linalg.norm(vectors, axis=1).max())
     if largest < LEAST_TURN_DEG:
         raise SensorError(

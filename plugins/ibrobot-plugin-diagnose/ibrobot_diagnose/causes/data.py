@@ -26,7 +26,7 @@ class OtherPrompt(CardCause):
     def compare(self, window: Window, card: Card) -> Evidence | None:
         known = [text for text in card.prompts if text]
         if "demonstration" in window.streams:  # the others of a dataset may have the same fault
-            most = max(card.prompts.values())
+            most = max(card.prompts.values(), default=0)
             if most < 2:
                 return None  # each of the others has a task of its own
             known = [text for text in known if card.prompts[text] > 0.1 * most]
