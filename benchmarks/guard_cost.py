@@ -18,7 +18,6 @@ import argparse
 import itertools
 import logging
 import os
-import shutil
 import statistics
 import struct
 import sys
@@ -265,18 +264,17 @@ def floods(seconds: float) -> dict[str, float]:
     """Each flood, after the same run without one."""
     worse, rng = 0, np.random.default_rng(4)
     CLOUDS.extend(WorldChange({"cloud": cloud(rng)}).message() for _ in range(4))
-    folder = Path(tempfile.mkdtemp())
-    bowl(folder / "bowl.stl")
-    for name, flood in FLOODS.items():
-        calm = run(seconds, guarded=True)
-        flooded = run(seconds, guarded=True, flood=flood, more=[f"world.meshes={folder}"])
-        worse += max(0, flooded["missed"] - calm["missed"])
-        print(
-            f"{name}: {flooded['changes']} changes, {flooded['pairs']} pairs at the end; missed {flooded['missed']},"
-            f" {calm['missed']} without; lateness p99 {flooded['p99']} and {calm['p99']} us",
-            flush=True,
-        )
-    shutil.rmtree(folder)
+    with tempfile.TemporaryDirectory() as folder:
+        bowl(Path(folder) / "bowl.stl")
+        for name, flood in FLOODS.items():
+            calm = run(seconds, guarded=True)
+            flooded = run(seconds, guarded=True, flood=flood, more=[f"world.meshes={folder}"])
+            worse += max(0, flooded["missed"] - calm["missed"])
+            print(
+                f"{name}: {flooded['changes']} changes, {flooded['pairs']} pairs at the end; missed"
+                f" {flooded['missed']}, {calm['missed']} without; lateness p99 {flooded['p99']} and {calm['p99']} us",
+                flush=True,
+            )
     return {"missed_more_in_floods": worse}
 
 
