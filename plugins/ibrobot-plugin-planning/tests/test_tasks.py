@@ -254,8 +254,10 @@ def test_policy_runs_for_its_time_and_the_planner_takes_over_again(run):
 
 
 @pytest.mark.parametrize("prompt", ["", "pick up the cube"])
-def test_policy_is_given_the_prompt_of_the_step(run, prompt: str):
+@pytest.mark.parametrize("before", ["plan", "policy"])
+def test_policy_is_given_the_prompt_of_the_step(run, before: str, prompt: str):
     runtime = run()
+    runtime.switch_mode(before)
     given = []
     runtime.session.bus.unserve(SET_MODE)
 
@@ -265,7 +267,8 @@ def test_policy_is_given_the_prompt_of_the_step(run, prompt: str):
 
     runtime.session.bus.serve(SET_MODE, switch)
     perform(runtime, steps(f"run_policy: {{mode: policy, seconds: 0.1, prompt: {prompt!r}}}"))
-    assert [(each.mode, each.prompt) for each in given] == [("policy", prompt), ("plan", "")]
+    entered = [("policy", prompt)] if prompt or before == "plan" else []
+    assert [(each.mode, each.prompt) for each in given] == [*entered, ("plan", "")]
 
 
 def test_policy_without_success_fails_the_step(run):

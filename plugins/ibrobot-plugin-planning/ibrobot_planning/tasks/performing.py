@@ -175,7 +175,7 @@ class Performance:
             raise StepFailed("the robot stopped: an emergency stop")
 
     def _enter(self, mode: str, prompt: str = "") -> None:
-        if self._session.mode != mode:
+        if prompt or self._session.mode != mode:  # the policy of the present mode may have another prompt
             self._session.bus.call(SET_MODE, SetMode(mode, prompt))
 
     # Steps.
