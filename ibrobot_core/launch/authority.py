@@ -370,7 +370,7 @@ class Authority:
         self._session.bus.publish(AGENT_LOG, String(dumps(entry, default=str)), latched=event in ("armed", "ended"))
         shown = " ".join(f"{key}={_cut(' '.join(str(value).split()), _MOST_SHOWN)}" for key, value in facts.items())
         self._session.log.info("agent %s: %s %s", agent.name, event, shown)
-        for call in self.told:
+        for call in tuple(self.told):  # one that stops listening meanwhile keeps nothing from the others
             call(entry)
 
 

@@ -59,6 +59,19 @@ def test_plan_that_was_admitted_does_not_overtake_the_end_of_the_authority() -> 
     authority.close()
 
 
+def test_listener_that_stops_listening_keeps_no_event_from_the_others() -> None:
+    _, authority = armed(lambda command: None, lambda plan: None)
+    events: list[str] = []
+
+    def once(_: Any) -> None:
+        authority.told.remove(once)
+
+    authority.told += [once, lambda entry: events.append(entry["event"])]
+    authority.end("disarmed")
+    assert events == ["ended"]
+    authority.close()
+
+
 def test_end_of_an_authority_does_not_lift_the_speed_limit_of_the_next_one() -> None:
     speeds: list[float] = []
     again: list[Grant] = []
