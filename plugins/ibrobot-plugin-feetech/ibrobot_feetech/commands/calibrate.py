@@ -96,24 +96,22 @@ def calibrate_arm(
     turning = [
         joint.name for joint in joints if joint.name in full_turn or joint.name.removeprefix(prefix) in full_turn
     ]
+    answers = answers or Answers()
     with opened(port, joints=by_servo(joints)) as bus:
         if torque is not None:
             measured = measure_by_motor(
                 bus, guide, joints, full_turn=turning, compared=compared, zero_at=zero_at, torque=torque, yes=yes,
-                answers=answers or Answers(),
+                answers=answers,
             )  # fmt: skip
         else:
             _prepare(bus, guide, yes)
             try:
-                measurement = Measurement(
-                    bus, guide, joints, full_turn=turning, compared=compared, zero_at=zero_at,
-                    answers=answers or Answers(),
-                )  # fmt: skip
-                measured = measurement.run()
+                measured = Measurement(
+                    bus, guide, joints, full_turn=turning, compared=compared, zero_at=zero_at, answers=answers
+                ).run()
             except BaseException:
-                guide.say(
-                    "Nothing was written. The torque is off, and the servos' calibration is unchanged.", warning=True
-                )
+                unchanged = "Nothing was written. The torque is off, and the servos' calibration is unchanged."
+                guide.say(unchanged, warning=True)
                 raise
         usb = usb_port(bus.port.path)
         adapter = usb.serial_number if usb is not None else ""

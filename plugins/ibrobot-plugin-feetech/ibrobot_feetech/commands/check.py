@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 
 import attrs
 from ibrobot_calibration import Calibration, load_calibration
-from ibrobot_calibration.plausibility import oddities
 from ibrobot_terminal import Guide
 
 from ibrobot_core.api import option
@@ -14,7 +13,7 @@ from ibrobot_core.app import Declined, Unsuccessful
 from ibrobot_feetech.arm import calibrated_registers, relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import TerminalGuide
-from ibrobot_feetech.commands.joints import Joint, joints_of
+from ibrobot_feetech.commands.joints import Joint, arm_of, joints_of
 from ibrobot_feetech.commands.measure import turned_by_hand
 from ibrobot_feetech.commands.ports import OnPort, opened
 from ibrobot_feetech.commands.zero import zero_text
@@ -105,9 +104,8 @@ def check_arm(
 
 def odd_ranges(calibration: Calibration, joints: Sequence[Joint], *, leader: bool = False) -> Iterator[str]:
     """What is odd about a calibration; the gripper of a leader is not compared, since its range is another one."""
-    for joint in joints:
-        numbers = attrs.asdict(calibration.joints[joint.name]) | {"closed_at": joint.lower if joint.anchored else None}
-        yield from oddities(joint.name, numbers, None if leader and joint.anchored else (joint.lower, joint.upper))
+    limits = {joint.name: (joint.lower, joint.upper) for joint in joints if not (leader and joint.anchored)}
+    return arm_of(joints, calibration).oddities(limits)
 
 
 def _reversed(

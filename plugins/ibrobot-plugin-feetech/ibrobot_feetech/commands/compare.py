@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import attrs
 import numpy as np
-from ibrobot_calibration import Calibration, load_calibration
+from ibrobot_calibration import load_calibration
 from ibrobot_terminal import Guide
 
 from ibrobot_core.api import HardwareError, Vector, option
 from ibrobot_core.app import Declined, Unsuccessful
-from ibrobot_feetech.arm import Arm, find_servos, relax
+from ibrobot_feetech.arm import find_servos, relax
 from ibrobot_feetech.commands.dialogue import TerminalGuide
-from ibrobot_feetech.commands.joints import Joint, joints_of
+from ibrobot_feetech.commands.joints import Joint, arm_of, joints_of
 from ibrobot_feetech.commands.ports import OnPort, opened
 from ibrobot_feetech.options import TOOL
 from ibrobot_feetech.usb import check_adapter
@@ -68,11 +68,9 @@ def compare_arms(
     if not yes and not guide.confirm("Go on?", flag="--yes", default=True):
         raise Declined
     poses: list[tuple[Vector, Vector]] = []
-    with (
-        opened(port, joints=_by_servo(follower)) as bus,
-        opened(leader_port, joints=_by_servo(leader)) as other,
-    ):
-        arms = [(bus, _arm(names, follower, joints)), (other, _arm(names, leader, joints))]
+    ours, theirs = arm_of(joints, follower), arm_of(joints, leader)
+    with opened(port, joints=ours.names) as bus, opened(leader_port, joints=theirs.names) as other:
+        arms = [(bus, ours), (other, theirs)]
         for each, arm in arms:
             check_adapter(arm.calibration, each.port.path)
             find_servos(each, arm)
@@ -93,14 +91,6 @@ def compare_arms(
     if not fails:
         guide.say(f"{len(joints)} joints compared in {len(POSES)} poses: none fails")
     return not fails
-
-
-def _by_servo(calibration: Calibration) -> Mapping[int, str]:
-    return {joint.id: name for name, joint in calibration.joints.items()}
-
-
-def _arm(names: tuple[str, ...], calibration: Calibration, joints: Sequence[Joint]) -> Arm:
-    return Arm(names, calibration, {joint.name: joint.lower for joint in joints if joint.anchored})
 
 
 def _verdict(joint: Joint, column: int, poses: Sequence[tuple[Vector, Vector]]) -> tuple[tuple[str, ...], str]:

@@ -575,10 +575,10 @@ def misfit(joint: Joint, between: Range, torque: float) -> str | None:
 
 
 def missing_servos(bus: FeetechBus, joints: Sequence[Joint]) -> None:
-    """Check that every servo answers, and that no servo has an id that no joint has.
+    """Check that the servo of every joint answers.
 
     Raises:
-        HardwareError: if one does not; with the ids that answer.
+        HardwareError: if one does not; names a servo that answers instead, whose id no joint has.
     """
     wanted = {joint.servo: joint.name for joint in joints}
     answering = bus.scan(one_by_one=False)

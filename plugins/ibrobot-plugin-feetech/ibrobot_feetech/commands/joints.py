@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import attrs
+from ibrobot_calibration import Calibration
 
 from ibrobot_core.app import RequestError
+from ibrobot_feetech.arm import Arm
 from ibrobot_feetech.options import FollowerOptions
 
 SO101 = {
@@ -70,6 +72,12 @@ def chosen(joints: Sequence[Joint], names: Sequence[str]) -> list[Joint]:
         if name not in known:
             raise RequestError(f"--joint: no joint {name!r}; available: {', '.join(known)}")
     return [known[name] for name in names] or list(joints)
+
+
+def arm_of(joints: Sequence[Joint], calibration: Calibration) -> Arm:
+    """The joints with a calibration that has them all."""
+    closed = {joint.name: joint.lower for joint in joints if joint.anchored}
+    return Arm(tuple(joint.name for joint in joints), calibration, closed)
 
 
 def by_servo(joints: Sequence[Joint]) -> dict[int, str]:
