@@ -130,9 +130,9 @@ class Finder(Component):
         try:
             detections = detector.find(name, sights)
             if not isinstance(detections, Sequence):
-                raise ValueError(f"it has found {detections!r:.80}, must be a list of Detection")
+                raise ValueError(f"its result is {detections!r:.80}, must be a list of Detection")
             if len(detections) > _MOST:
-                raise ValueError(f"it has found {len(detections)} objects, at most {_MOST} are answered")
+                raise ValueError(f"its result has {len(detections)} objects, at most {_MOST} are allowed")
             return [_checked(type_, each) for each in detections]
         except IbrobotError:
             raise
@@ -185,7 +185,7 @@ def _usable(info: CameraInfo | None) -> CameraInfo:
     if info is None or not info.k.any():
         raise ValueError("it has no calibration; `ibrobot camera calibrate` makes one")
     if info.distortion_model != "plumb_bob" or len(info.d) > _PLUMB_BOB:
-        raise ValueError(f"distortion model {info.distortion_model} is not known here; plumb_bob is")
+        raise ValueError(f"distortion model {info.distortion_model} is not supported; plumb_bob is")
     if not np.isfinite([*info.k, *info.d]).all() or min(info.k[0], info.k[4]) <= 0 or min(info.width, info.height) <= 1:
         raise ValueError("its calibration has no finite focal lengths")
     return info
@@ -213,7 +213,7 @@ def _checked(detector: str, each: Detection) -> FoundObject:
         ValueError: for one that is not as `Detection` says.
     """
     if not isinstance(each, Detection):
-        raise ValueError(f"it has found {each!r:.80}, must be Detection")
+        raise ValueError(f"its result has {each!r:.80}, must be Detection")
     if not isinstance(each.name, str):
         raise ValueError(f"its name is {each.name!r:.80}, must be text")
     try:

@@ -111,7 +111,7 @@ def test_a_place_in_a_picture_chooses_what_is_seen_there(rig: Rig, at: tuple[flo
         ({"k": np.zeros(9)}, "it has no calibration; `ibrobot camera calibrate` makes one"),
         ({"k": np.full(9, np.nan)}, "its calibration has no finite focal lengths"),
         ({"k": -K}, "its calibration has no finite focal lengths"),
-        ({"model": "equidistant"}, "distortion model equidistant is not known here; plumb_bob is"),
+        ({"model": "equidistant"}, "distortion model equidistant is not supported; plumb_bob is"),
         ({"placed": False}, "no transform of frame 'side_optical_frame' to the base; peripherals[].transform says"),
         ({"size": (20, 10)}, "its pictures have 8 x 6 pixels, its calibration is for 20 x 10"),
     ],

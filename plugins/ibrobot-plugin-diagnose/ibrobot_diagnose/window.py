@@ -251,19 +251,19 @@ class Window:
         document = _object(self.metadata, "config", self.name)
         for section, kind in _SECTIONS.items():
             if not isinstance(document.get(section) or kind(), kind):
-                raise RecorderError(f"{self.name}: config: {section}: is no {kind.__name__} of the robot YAML")
+                raise RecorderError(f"{self.name}: config: {section}: must be a {kind.__name__}")
         joints = (document.get("robot") or {}).get("joints") or []
         lists = {"robot.joints": joints, "peripherals": document.get("peripherals") or []}
         modes = list((document.get("control_modes") or {}).values())
         for name, listed in {**lists, "control_modes": modes}.items():
             if not isinstance(listed, list) or not all(isinstance(each, dict) for each in listed):
-                raise RecorderError(f"{self.name}: config: {name}: has something else than objects")
+                raise RecorderError(f"{self.name}: config: {name}: must contain only objects")
         for mode in modes:
             dispatch = mode.get("dispatch") or {}
             smoothing = dispatch.get("smoothing") or {} if isinstance(dispatch, dict) else None
             coefficient = smoothing.get("temporal_ensemble_coeff", 0.0) if isinstance(smoothing, dict) else None
             if not isinstance(coefficient, int | float) or abs(coefficient) > _FARTHEST:
-                raise RecorderError(f"{self.name}: config: control_modes: dispatch: is none of the robot YAML")
+                raise RecorderError(f"{self.name}: config: control_modes: dispatch: is not valid in a robot YAML")
         return document
 
     @cached_property
@@ -307,7 +307,7 @@ def _object(metadata: Mapping[str, str], key: str, name: str) -> Mapping[str, An
     except (ValueError, RecursionError) as error:
         raise RecorderError(f"{name}: its metadata {key} cannot be read: {error}") from None
     if not isinstance(value, dict):
-        raise RecorderError(f"{name}: its metadata {key} is no object")
+        raise RecorderError(f"{name}: its metadata {key} is not an object")
     return value
 
 
@@ -350,7 +350,7 @@ def _contract_of(summary: EpisodeSummary) -> Contract:
     names: list[object] = [name for part in contract.action_parts for name in part.joints]
     topics = [*(part.topic for part in contract.observation_parts), *(part.topic for part in contract.action_parts)]
     if not all(isinstance(each, str) for each in (*topics, *names)):
-        raise RecorderError(f"{summary.path}: its contract has a topic or a joint whose name is no text")
+        raise RecorderError(f"{summary.path}: its contract has a topic or a joint whose name is not text")
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise RecorderError(f"{summary.path}: its contract commands {twice[0]} twice, so its joints are unknown")
     return contract
@@ -406,7 +406,7 @@ class _Reading:
         if count > _MOST_TICKS:
             raise RecorderError(
                 f"{summary.path}: its messages span {(summary.end_ns - summary.start_ns) / NS_PER_S:.0f} s, {count} "
-                f"ticks of its contract; at most {_MOST_TICKS} are looked at. If the clock was set while it was "
+                f"ticks of its contract; at most {_MOST_TICKS} are allowed. If the clock was set while it was "
                 "recorded, keep the part before or after: `ibrobot episodes trim`"
             )
         ticks = summary.start_ns + np.arange(count, dtype=np.int64) * step_ns
@@ -476,7 +476,7 @@ def _asked_of(message: ModelAnswer, path: Path) -> Asked:
         raise RecorderError(f"{what} took {message.latency_ms} ms")
     chunk = message.actions.reshape(-1, size) if size else np.empty((0, 0))
     if not (np.abs(chunk) <= _FARTHEST).all():
-        raise RecorderError(f"{what} has an action that is no finite number")
+        raise RecorderError(f"{what} has an action that is not a finite number")
     return Asked(message, chunk)
 
 

@@ -61,7 +61,7 @@ def of_answers(**numbers: Any) -> Change:
         ({"step_ns": 0}, "answer 1 of the model has actions for 4 joints, 0 ns apart"),
         ({"joint_names": ()}, "answer 1 of the model has actions for 0 joints"),
         ({"latency_ms": float("nan")}, "answer 1 of the model took nan ms"),
-        ({"actions": np.full(160, np.inf)}, "answer 1 of the model has an action that is no finite number"),
+        ({"actions": np.full(160, np.inf)}, "answer 1 of the model has an action that is not a finite number"),
     ],
 )
 def test_damaged_answer_is_named(numbers, problem):
@@ -83,14 +83,14 @@ def test_clock_that_was_set_takes_no_memory_and_is_named():
     [
         ("config", "{", "its metadata config cannot be read"),
         ("config", "[" * 100_000, "its metadata config cannot be read"),
-        ("config", "[]", "its metadata config is no object"),
-        ("policy", "3", "its metadata policy is no object"),
+        ("config", "[]", "its metadata config is not an object"),
+        ("policy", "3", "its metadata policy is not an object"),
         ("config", '{"control": []}', None),
-        ("config", '{"control": [1]}', "config: control: is no dict of the robot YAML"),
-        ("config", '{"control_modes": {"learned": 3}}', "config: control_modes: has something else than objects"),
-        ("config", '{"robot": {"joints": ["pan"]}}', "config: robot.joints: has something else than objects"),
-        ("config", '{"peripherals": [3]}', "config: peripherals: has something else than objects"),
-        ("config", '{"control_modes": {"learned": {"dispatch": "fast"}}}', "config: control_modes: dispatch: is none"),
+        ("config", '{"control": [1]}', "config: control: must be a dict"),
+        ("config", '{"control_modes": {"learned": 3}}', "config: control_modes: must contain only objects"),
+        ("config", '{"robot": {"joints": ["pan"]}}', "config: robot.joints: must contain only objects"),
+        ("config", '{"peripherals": [3]}', "config: peripherals: must contain only objects"),
+        ("config", '{"control_modes": {"learned": {"dispatch": "fast"}}}', "config: control_modes: dispatch: is not"),
         ("contract", "[" * 100_000, "has no contract"),
         ("contract", {"rate_hz": 1e-300}, "the rate of its contract is 1e-300 Hz"),
         ("contract", {"rate_hz": float("inf")}, "the rate of its contract is inf Hz"),
@@ -110,7 +110,7 @@ def test_damaged_metadata_is_named(key, text, problem):
 def test_contract_with_a_topic_that_is_no_text_is_named():
     contract = json.loads(metadata(RUN)["contract"])
     contract["action"][0]["topic"] = ["/a"]
-    with pytest.raises(RecorderError, match="made: its contract has a topic or a joint whose name is no text"):
+    with pytest.raises(RecorderError, match="made: its contract has a topic or a joint whose name is not text"):
         read_window(Changed(contract=json.dumps(contract)))
 
 

@@ -104,7 +104,7 @@ def compare(answers: Answered, guide: Guide) -> None:
         raise HardwareError("give the port of the leader")
     leader = _name({"name": answers["leader_name"], "leader": True})
     if not compare_arms(guide, _port(answers), leader_port, _name(answers), leader):
-        raise HardwareError("leader and follower do not stand to each other as they should")
+        raise HardwareError("leader and follower do not match")
 
 
 def _port(answers: Answered) -> str | None:

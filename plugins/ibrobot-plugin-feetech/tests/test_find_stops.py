@@ -216,7 +216,7 @@ def test_cable_that_yields_is_harmless(rig):
 
 def test_joint_that_is_mounted_the_other_way_is_known_by_its_weight(rig):
     rig.mechanics(3).gravity *= -1
-    rig.refuses("elbow_flex: to hold it takes 1[0-9].* it is reversed, or the arm does not stand upright")
+    rig.refuses("elbow_flex: holding it takes 1[0-9].* it is reversed, or the arm does not stand upright")
 
 
 def test_person_says_which_way_joints_turn(rig):

@@ -131,7 +131,7 @@ def _carried(
     bodies = ", ".join(each.name for each in spec.bodies)
     urdf = read_urdf(config.robot.description.urdf) if config.robot.description.urdf is not None else None
     if urdf is None or parent not in urdf.links:
-        raise KinematicsError(f"its parent {parent} is no link, and no body of the MJCF; these are: {bodies}")
+        raise KinematicsError(f"its parent {parent} is neither a link nor a body of the MJCF; bodies: {bodies}")
     # Links and bodies have names of their own; joints, and the place of the base, are the same in both.
     chain = Chain(urdf, config.robot.joint_names, urdf.root, parent)
     link = chain.pose(np.zeros(len(config.robot.joint_names)))

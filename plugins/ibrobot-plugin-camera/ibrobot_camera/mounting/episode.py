@@ -180,7 +180,7 @@ class Source:
         if view is None:
             taken.others["pictures are blurred" if _is_blurred(shown) else "pictures show too little of the board"] += 1
         elif (shot := shot_of(view, joints, lens)) is None:
-            taken.others["show corners that are not those of a flat board with these squares"] += 1
+            taken.others["show corners that do not fit a flat board with these squares"] += 1
         else:
             taken.shots.append(shot)
 

@@ -62,14 +62,14 @@ def check_turns(session: Session) -> None:
     if largest < LEAST_TURN_DEG:
         raise SensorError(
             f"the arm turns the {_carried(session)} by at most {largest:.0f} degrees, at least {LEAST_TURN_DEG:g} are "
-            "needed: only turns tell where the camera is"
+            "needed: without turns, the position of the camera cannot be determined"
         )
     second = float(np.sqrt(np.linalg.eigvalsh(vectors.T @ vectors / len(vectors))[1]))
     if second < LEAST_SECOND_DEG:
         raise SensorError(
             f"the arm turns the {_carried(session)} about one axis only (about another one by {second:.1f} degrees on "
-            f"average, at least {LEAST_SECOND_DEG:g} are needed), which leaves the place along this axis open: turn "
-            "the wrist, too"
+            f"average, at least {LEAST_SECOND_DEG:g} are needed), so the position along this axis stays unknown: "
+            "turn the wrist, too"
         )
 
 
@@ -129,8 +129,8 @@ def _explanations(session: Session) -> Iterator[tuple[float, str]]:
         errors = np.concatenate([session.some(part).fit().errors for part in (rows, ~rows)])
         yield (
             float(np.quantile(errors, USUAL)),
-            f"the pictures before and after {shots[at].name} fit each among themselves, but not together: the board or "
-            "the camera has moved there",
+            f"the pictures before and after {shots[at].name} fit each other, but not together: the board or the camera "
+            "has moved there",
         )
 
 

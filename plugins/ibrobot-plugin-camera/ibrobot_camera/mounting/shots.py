@@ -38,7 +38,7 @@ class Lens:
             SensorError: if it has no focal length, or another model of distortion.
         """
         if info.distortion_model != "plumb_bob" or len(info.d) > 5:
-            raise SensorError(f"distortion model {info.distortion_model} is not known here; plumb_bob is")
+            raise SensorError(f"distortion model {info.distortion_model} is not supported; plumb_bob is")
         matrix = info.k.reshape(3, 3)
         if not np.isfinite([*info.k, *info.d]).all() or not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
             raise SensorError("the calibration has no finite focal lengths; `ibrobot camera calibrate` measures them")

@@ -18,7 +18,7 @@ MOST_MM, MOST_DEG = 20.0, 6.0
 MOST_UNCERTAIN_MM, MOST_UNCERTAIN_DEG = 8.0, 1.5
 """Greatest standard deviation of the result."""
 _PARTS = 5
-"""The pictures of a part are foretold from those of the other parts."""
+"""Number of parts of a cross-validation."""
 
 
 @attrs.frozen(eq=False)
@@ -36,7 +36,7 @@ class Mounting:
     error_px: float
     """Median distance of the corners from their places."""
     error_mm: float
-    """Of cross-validation: how far the board is from where the other pictures say, median."""
+    """Of cross-validation: how far the board is from where the other pictures predict it, median."""
     error_deg: float
     uncertain_mm: float
     """Standard deviation of the camera's place."""
@@ -94,12 +94,12 @@ def solve_mount(session: Session, seen: str = "") -> Mounting:
     if error_mm > MOST_MM or error_deg > MOST_DEG:
         raise SensorError(
             f"in cross-validation the board is {error_mm:.0f} mm and {error_deg:.1f} degrees from where the other "
-            f"pictures say, at most {MOST_MM:g} mm and {MOST_DEG:g} degrees are allowed: were camera and board fixed, "
-            "did the arm stand still, and are the zeros of the joints and the URDF right?"
+            f"pictures predict it; at most {MOST_MM:g} mm and {MOST_DEG:g} degrees are allowed: were camera and board "
+            "fixed, did the arm stand still, and are the zeros of the joints and the URDF right?"
         )
     if uncertain_mm > MOST_UNCERTAIN_MM or uncertain_deg > MOST_UNCERTAIN_DEG:
         raise SensorError(
-            f"the place of the camera is known to {uncertain_mm:.0f} mm and {uncertain_deg:.1f} degrees only, at most "
+            f"the mount is known only to {uncertain_mm:.0f} mm and {uncertain_deg:.1f} degrees; at most "
             f"{MOST_UNCERTAIN_MM:g} mm and {MOST_UNCERTAIN_DEG:g} degrees are allowed: take more pictures, turned to "
             "all sides and nearer to the board"
         )

@@ -93,8 +93,8 @@ class ReadingsMissing(Cause):
     needs = frozenset({"motion", "state"})
     explains = _CONSEQUENCES | {"unseen_success", "joint_order", "joint_zero"}
     remedy = (
-        "Look at this joint's cable and motor, and at what delivers its positions: what was no number was recorded as "
-        "it came. What is said of the motion holds for the rest only, and no training bears such a number."
+        "Check this joint's cable and motor, and the program that delivers its positions; they were recorded as they "
+        "came. Statements about the motion hold for the other readings only, and no training can use such numbers."
     )
 
     @override
@@ -110,7 +110,7 @@ class ReadingsMissing(Cause):
         share, joint, what = worst
         if share <= 0:
             return None
-        text = f"{joint} has no position in {100 * share:.0f} % of the {what}, or one that is no finite number."
+        text = f"{joint} has no position in {100 * share:.0f} % of the {what}, or one that is not a finite number."
         return Evidence(text, 100 * share, "%", 2.0, likelihood(share, 0.02, 0.1))
 
 

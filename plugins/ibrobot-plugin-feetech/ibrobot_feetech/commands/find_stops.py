@@ -538,7 +538,7 @@ class StopFinder:
         if pulls == (-expected if inverted else expected):
             return None
         return (
-            f"{joint.name}: to hold it takes {abs(mean) / 10:.1f} % of the torque, in the direction that its weight "
+            f"{joint.name}: holding it takes {abs(mean) / 10:.1f} % of the torque, in the direction that its weight "
             "should pull: it is reversed, or the arm does not stand upright; --check-signs asks for the direction of "
             "each joint"
         )
