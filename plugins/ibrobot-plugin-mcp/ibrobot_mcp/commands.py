@@ -73,13 +73,18 @@ class ArmAgent(_OfRun):
         echo(f"{agent} on {path.stem}: for {self.seconds:g} s, {self.speed:.0%} of the speed limits")
         echo(f"services: {', '.join(services)}")
         echo(f"region: {', '.join(self.region) or 'no limits but those of the joints'}")
-        self._show(agent, ask(path, ASKED))
+        self._show(agent, path)
         if not self.yes and not confirm("Let the agent move the robot?", flag="--yes"):
             raise IbrobotError("nothing was granted")
         echo(ask(path, "/agent/arm", grant))
 
-    def _show(self, agent: str, asked: Mapping[str, Any] | None) -> None:
+    def _show(self, agent: str, path: Path) -> None:
         """Show what the agent asked for last, and how it would move."""
+        try:
+            asked = ask(path, ASKED)
+        except IbrobotError as error:  # a plan may take longer than an answer; the person can decide without it
+            echo(f"what it asks for is not known: {error}")
+            return
         if asked is None or asked["agent"] != agent or not asked["refused"]:
             return
         echo(f"it asks for: {asked['service']} {asked['request']}")

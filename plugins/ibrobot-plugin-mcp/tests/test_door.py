@@ -17,7 +17,7 @@ from typing import Any, cast, override
 
 import httpx2
 import pytest
-from ibrobot_mcp import audit, ibrobot_commands, ibrobot_sections, stdio
+from ibrobot_mcp import audit, commands, ibrobot_commands, ibrobot_sections, persons, stdio
 from ibrobot_mcp.audit import authority_of
 from ibrobot_mcp.commands import AddAgent, ArmAgent, DisarmAgent, ListAgents, RemoveAgent, ShowAgents
 from ibrobot_mcp.door import AgentDoor
@@ -514,6 +514,38 @@ def test_an_agent_cannot_take_the_sessions_of_others(door: AgentDoor, token: str
             return [*taken, (await http.post(door.url, json=first, headers=accepts)).status_code]
 
     assert asyncio.run(talk()) == [200] * 8 + [503] * 2 + [200]
+
+
+def test_person_sees_what_the_agent_asks_for_before_granting_it(
+    door: AgentDoor, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A person who grants by the command sees the request, and why there is no path."""
+    bus, authority = door.session.bus, authority_of(door.session)
+    bus.serve(stand_in("/planning/go_to"), lambda request: None)
+    agent = authority.join("claude")
+    with pytest.raises(HardwareError, match="may not move the robot"):
+        authority.call(agent, "/planning/go_to", {"goal": "home"})
+    ArmAgent(yes=True)()
+    shown = capsys.readouterr().out
+    assert 'it asks for: /planning/go_to {"goal": "home"}\n' in shown
+    assert re.search(r"^path: none: .*/planning/plan", shown, re.MULTILINE)
+    assert authority.status().armed == agent.name
+
+
+def test_person_can_grant_what_takes_long_to_plan(
+    door: AgentDoor, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slow(path: Path, service: str, request: Any = None) -> Any:
+        if service == persons.ASKED:
+            raise IbrobotError(f"{path.name} does not answer: timed out")
+        return ask(path, service, request)
+
+    monkeypatch.setattr(commands, "ask", slow)
+    authority = authority_of(door.session)
+    agent = authority.join("claude")
+    ArmAgent(yes=True)()
+    assert re.search(r"^what it asks for is not known: .* does not answer: timed out$", capsys.readouterr().out, re.M)
+    assert authority.status().armed == agent.name
 
 
 def test_region_that_is_given_twice_is_refused(door: AgentDoor) -> None:
