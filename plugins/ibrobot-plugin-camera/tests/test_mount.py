@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import attrs
@@ -11,6 +12,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ibrobot_camera.intrinsics.board import Board
+from ibrobot_camera.mounting import episode
 from ibrobot_camera.mounting.closed import SOLVERS, solved
 from ibrobot_camera.mounting.edit import with_transform
 from ibrobot_camera.mounting.fit import Session
@@ -22,7 +25,7 @@ from ibrobot_kinematics.poses import homogeneous, matrix
 from ibrobot_kinematics.rotations import exp
 from ibrobot_kinematics.urdf import read_urdf
 
-from ibrobot_core.api import IbrobotError, Pose, SensorError
+from ibrobot_core.api import CameraInfo, Header, IbrobotError, Pose, SensorError
 from ibrobot_core.app import parse_yaml
 
 from .mount_rig import JOINTS, LENS, OPTICAL, made, off, urdf
@@ -200,3 +203,28 @@ def test_corners_that_are_not_of_the_board_are_left_out(tmp_path: Path) -> None:
     assert kept is not None
     assert len(kept.view.ids) <= len(corners) - 8
     assert off(kept.board, shot.board)[0] < 2.0
+
+
+@pytest.mark.parametrize(
+    ("info", "wrong"),
+    [
+        ({"k": np.ones(9), "distortion_model": "equidistant"}, "distortion model equidistant is not supported"),
+        ({"k": np.ones(9), "d": np.ones(8)}, "the calibration has 8 numbers of distortion, plumb_bob has at most 5"),
+        ({"k": np.array([-5.0, 0, 3, 0, 5, 2, 0, 0, 1])}, "the calibration has no finite focal lengths"),
+        ({"k": np.array([np.nan, 0, 3, 0, 5, 2, 0, 0, 1])}, "the calibration has no finite focal lengths"),
+        ({"k": np.ones(9), "d": np.full(5, np.inf)}, "the calibration has no finite focal lengths"),
+    ],
+)
+def test_a_calibration_that_cannot_be_used_is_named_with_its_episode(
+    monkeypatch: pytest.MonkeyPatch, info: dict[str, Any], wrong: str
+) -> None:
+    message = attrs.evolve(CameraInfo(Header(0, "eye"), 48, 64), **info)
+    reader = SimpleNamespace(
+        summary=lambda: SimpleNamespace(topics=(episode.JOINT_STATES, "/camera/eye/image_raw")),
+        messages=lambda topics: [SimpleNamespace(message=message)],
+        close=lambda: None,
+    )
+    monkeypatch.setattr(episode, "installed_plugins", lambda: SimpleNamespace(open_episode=lambda path: reader))
+    source = episode.Source("/camera/eye/image_raw", JOINTS, (0,), Board(), None)
+    with pytest.raises(SensorError, match=f"^bag: /camera/eye/image_raw: {wrong}"):
+        source.read(Path("bag"), "")

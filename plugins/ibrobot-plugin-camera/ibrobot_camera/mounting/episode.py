@@ -111,7 +111,10 @@ class Source:
                 f"{path}: the camera has no calibration on {topic}: measure its lens with `ibrobot camera calibrate`, "
                 "and put the file into the robot YAML as `info`"
             )
-        return Lens.of(info)
+        try:
+            return Lens.of(info)
+        except SensorError as error:
+            raise SensorError(f"{path}: {self.camera}: {error}") from None
 
     def _states(self, reader: EpisodeReader, path: Path) -> tuple[NDArray[np.int64], Vector]:
         """Stamps [ns], shape (N,), and positions, shape (N, J)."""

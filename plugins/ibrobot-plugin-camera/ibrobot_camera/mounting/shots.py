@@ -37,8 +37,10 @@ class Lens:
         Raises:
             SensorError: if it has no focal length, or another model of distortion.
         """
-        if info.distortion_model != "plumb_bob" or len(info.d) > 5:
+        if info.distortion_model != "plumb_bob":
             raise SensorError(f"distortion model {info.distortion_model} is not supported; plumb_bob is")
+        if len(info.d) > 5:
+            raise SensorError(f"the calibration has {len(info.d)} numbers of distortion, plumb_bob has at most 5")
         matrix = info.k.reshape(3, 3)
         if not np.isfinite([*info.k, *info.d]).all() or not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
             raise SensorError("the calibration has no finite focal lengths; `ibrobot camera calibrate` measures them")
