@@ -486,7 +486,7 @@ def discover(points: Iterable[EntryPoint] | None = None) -> Registry:
     installed = [entry for entry in entry_points() if entry.group.partition(".")[0] == ENTRY_POINT_GROUP]
     own = [entry for entry in installed if entry.dist is not None and entry.dist.name == CORE]
     if not own:
-        message = f"the installed {CORE} has no plugin of its own: install it again, in a checkout by `uv sync`"
+        message = f"the installed {CORE} has no plugin of its own: install it again, in a clone with `uv sync`"
         raise PluginError(message)
     others = [entry for entry in (installed if points is None else points) if entry not in own]
     registry = Registry()

@@ -77,7 +77,7 @@ class Emulate:
         (), typed="--cable ID TICKS", help="with --mechanics, a cable that pulls a joint back from so many ticks on"
     )
     swing: float = option(
-        0.0, ge=0, le=0.5, unit="rad", help="how far a hand swings each joint without torque to and fro, as a leader's"
+        0.0, ge=0, le=0.5, unit="rad", help="how far joints without torque swing to each side, as if by hand"
     )
     errors: tuple[tuple[int, int], ...] = option((), typed="--error ID BITS", help="error bits of a servo")
 
