@@ -19,7 +19,9 @@ from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.schema import ModelConfig
 
 
-def check_model(config: RobotConfig, model: ModelConfig, spec: PolicySpec, log: logging.Logger) -> PolicyVectors:
+def check_model(
+    config: RobotConfig, model: ModelConfig, spec: PolicySpec, log: logging.Logger, given: str = ""
+) -> PolicyVectors:
     """Compare a policy with the contract, and with the modes that use it.
 
     Args:
@@ -27,6 +29,7 @@ def check_model(config: RobotConfig, model: ModelConfig, spec: PolicySpec, log: 
         model: the policy's entry under `models`.
         spec: the policy's spec.
         log: receives warnings.
+        given: prompt in place of those of the robot YAML.
 
     Returns:
         The conversion of vectors between the robot and the policy.
@@ -50,18 +53,17 @@ def check_model(config: RobotConfig, model: ModelConfig, spec: PolicySpec, log: 
             check_strategy(mode.dispatch, spec)
         except ContractError as error:
             raise ContractError(f"{where}.{error}") from None
-        if spec.prompt and not mode.inference.prompt:
-            raise ContractError(
-                f"{where}.inference.prompt: is missing; model {model.name!r} needs a prompt, "
-                "e.g. prompt: put the cube into the bin"
-            )
-        if mode.inference.prompt and not spec.prompt:
+        prompt = given or mode.inference.prompt
+        if spec.prompt and not prompt:
+            example = "e.g. prompt: put the cube into the bin"
+            raise ContractError(f"{where}.inference.prompt: is missing; model {model.name!r} needs a prompt, {example}")
+        if prompt and not spec.prompt:
             log.warning("%s.inference.prompt: model %r takes no prompt", where, model.name)
     return units
 
 
-def check_models(config: RobotConfig, registry: Plugins, modes: Iterable[str]) -> list[str]:
-    """Compare the models of some modes with the robot, without loading any.
+def check_models(config: RobotConfig, registry: Plugins, modes: Iterable[str], given: str = "") -> list[str]:
+    """Compare the models of some modes with the robot, without loading any; `given` is as for `check_model`.
 
     Returns:
         A line for each model.
@@ -75,7 +77,7 @@ def check_models(config: RobotConfig, registry: Plugins, modes: Iterable[str]) -
     for name in dict.fromkeys(inference.model for inference in used):
         try:
             with closing(build_policy(config, registry, name)) as policy:
-                check_model(config, config.models[name], policy.spec, logging.getLogger("ibrobot"))
+                check_model(config, config.models[name], policy.spec, logging.getLogger("ibrobot"), given)
                 if name in loaded_here:
                     policy.check_weights()
                 lines.append(_line(name, policy.spec))

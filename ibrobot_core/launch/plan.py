@@ -79,10 +79,11 @@ def mode_components(session: Session, name: str, link: TransportLink | None, pro
     mode = session.config.control_modes[name]
     if session.request.source is not None and name == session.config.default_control_mode:
         return ModeComponents((), session.request.source(session, mode))
-    if (inference := mode.inference) is not None:
+    if mode.inference is not None:
+        inference = attrs.evolve(mode.inference, prompt=prompt or mode.inference.prompt)
         model = LoadedModel(session, inference, link)
         needs = (CONTROL, *(f"sensor:{sensor.name}" for sensor in _sensors(session)))
-        policy = PolicySource(session, mode, attrs.evolve(inference, prompt=prompt or inference.prompt), model, needs)
+        policy = PolicySource(session, mode, inference, model, needs)
         if inference.intervene is None:
             return ModeComponents((model,), policy)
         return ModeComponents((model,), session.registry.create("source", "intervene", session, mode, policy), policy)

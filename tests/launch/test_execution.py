@@ -40,6 +40,30 @@ def test_a_prompt_is_there_where_the_policy_wants_one(
     assert "takes no prompt" not in caplog.text
 
 
+def test_prompt_of_a_request_stands_in_for_that_of_the_yaml(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    runs.start().stop()
+    make = runs.parts.Net.__init__
+
+    def wants_a_prompt(self: Any, *arguments: Any, **options: Any) -> None:
+        make(self, *arguments, **options)
+        self.spec = attrs.evolve(self.spec, prompt=True)
+
+    monkeypatch.setattr(runs.parts.Net, "__init__", wants_a_prompt)
+    runtime = runs.start(mode="teleop")
+    with pytest.raises(ComponentFailed, match=r"control_modes\.policy\.inference\.prompt: is missing"):
+        runtime.switch_mode("policy")
+    assert runtime.session.mode == "teleop"
+    runtime.switch_mode("policy", prompt="pick")
+    assert runtime.session.mode == "policy"
+
+
+def test_prompt_of_a_request_to_a_policy_that_takes_none_is_said(runs: Runs, caplog: pytest.LogCaptureFixture):
+    runtime = runs.start(mode="teleop")
+    assert "takes no prompt" not in caplog.text
+    runtime.switch_mode("policy", prompt="pick")
+    assert "control_modes.policy.inference.prompt: model 'net' takes no prompt" in caplog.text
+
+
 def test_policy_mode_is_entered_with_another_prompt(runs: Runs, monkeypatch: pytest.MonkeyPatch):
     runs.start().stop()
     make = runs.parts.Net.__init__

@@ -89,7 +89,7 @@ class LoadedModel(Component):
             self._policy = policy = session.make("policy", model, model.name)
             if self._inference.weights_here:
                 policy.check_weights()
-        self.units = check_model(session.config, model, policy.spec, session.log)
+        self.units = check_model(session.config, model, policy.spec, session.log, self._inference.prompt)
         topics = {part.topic for key in policy.spec.observations for part in self.contract.parts(key)}
         session.refuse_absent(f"model {model.name!r}", topics.__contains__)
         transport = self._link.transport if self._link is not None else None

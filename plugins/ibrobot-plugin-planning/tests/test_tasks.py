@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, override
 
+import attrs
 import numpy as np
 import pytest
 from ibrobot_planning.execution.requests import Numbered
@@ -16,6 +17,7 @@ from ibrobot_planning.tasks.result import TaskResult
 from ibrobot_planning.tasks.runner import CANCEL, CHECK, RESULT, RUN, STATUS, TaskRunner
 from ibrobot_planning.world.objects import SNAPSHOT
 from ibrobot_testing import SectionSuite
+from ibrobot_testing.fakes import FakePolicy
 
 from ibrobot_core.api import IbrobotError, PlanningError, String
 from ibrobot_core.app import SET_MODE, ConfigError, RequestError, Runtime
@@ -251,6 +253,22 @@ def test_policy_runs_for_its_time_and_the_planner_takes_over_again(run):
     assert result.success, result.message
     assert result.steps[0].duration_s == pytest.approx(0.5, abs=0.1)
     assert runtime.session.mode == "plan"
+
+
+def test_policy_that_needs_a_prompt_is_given_it_by_the_step_alone(run, monkeypatch):
+    """The mode has none."""
+    make = FakePolicy.__init__
+
+    def wants_a_prompt(self, *arguments):
+        make(self, *arguments)
+        self.spec = attrs.evolve(self.spec, prompt=True)
+
+    monkeypatch.setattr(FakePolicy, "__init__", wants_a_prompt)
+    runtime = run()
+    with pytest.raises(ConfigError, match=r"control_modes\.policy\.inference\.prompt: is missing"):
+        runtime.session.bus.call(CHECK, steps("run_policy: {mode: policy, seconds: 0.1}"))
+    result = perform(runtime, steps("run_policy: {mode: policy, seconds: 0.1, prompt: pick up the cube}"))
+    assert result.success, result.message
 
 
 @pytest.mark.parametrize("prompt", ["", "pick up the cube"])

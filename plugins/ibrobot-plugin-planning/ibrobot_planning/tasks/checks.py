@@ -327,7 +327,7 @@ class _Checks:
             self._available(key, step.mode)
         else:
             try:
-                check_models(_prompted(config, step), self._situation.registry, [step.mode])
+                check_models(config, self._situation.registry, [step.mode], step.prompt)
             except IbrobotError as error:
                 self._document.add(key, str(error))
 
@@ -361,12 +361,3 @@ def _goals(key: Key, step: MoveStep) -> Iterator[tuple[Key, GoalOptions]]:
             yield (*key, name, i), goal
     if not (step.any or step.line):
         yield key, step
-
-
-def _prompted(config: RobotConfig, step: PolicyStep) -> RobotConfig:
-    """The robot, with the prompt of a step for its mode."""
-    mode = config.control_modes[step.mode]
-    if not step.prompt or mode.inference is None:
-        return config
-    prompted = attrs.evolve(mode, inference=attrs.evolve(mode.inference, prompt=step.prompt))
-    return attrs.evolve(config, control_modes={**config.control_modes, step.mode: prompted})
