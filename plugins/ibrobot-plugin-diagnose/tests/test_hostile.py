@@ -15,6 +15,7 @@ from ibrobot_diagnose.contents import read_contents, write_report
 from ibrobot_diagnose.diagnosis import diagnose
 from ibrobot_diagnose.references import dataset_info
 from ibrobot_diagnose.report import Explanation
+from ibrobot_diagnose.testing import make_window
 from ibrobot_diagnose.window import Window, read_window
 from made_runs import START_NS, Made, Run, metadata, window_of
 
@@ -127,6 +128,15 @@ def test_positions_that_are_no_numbers_are_what_is_accused(value):
     diagnosis = diagnose(read_window(Changed(change)), Reference())
     assert (diagnosis.first, diagnosis.broken) == ("readings_missing", ())
     assert diagnosis.findings[0].evidence.text.startswith("lift has no position in 100 % of the readings")
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_joint_without_readings_is_diagnosed_beside_one_that_follows_exactly(joint):
+    """As in datasets whose commands are copies of the readings."""
+    states = np.sin(np.linspace([0, 1], [10, 11], 300))
+    states[:, joint] = np.nan
+    diagnosis = diagnose(make_window(states), Reference())
+    assert (diagnosis.first, diagnosis.broken) == ("readings_missing", ())
 
 
 def test_contract_without_joints_is_diagnosed():

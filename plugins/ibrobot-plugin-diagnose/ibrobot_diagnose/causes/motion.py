@@ -36,7 +36,7 @@ class ArmNotFollowing(Cause):
         if reference.card is not None and len(reference.card.following) == len(rests):
             known = np.array([each if each is not None else 0.035 for each in reference.card.following])
             usual = np.maximum(0.035, 1.3 * known)
-        ratio = np.nan_to_num(rests / usual)
+        ratio = np.nan_to_num(rests / usual, nan=-1.0)  # one that is unknown is never the worst
         j = int(np.argmax(ratio))
         joint, rest, delay = window.joints[j], float(rests[j]), float(delays[j])
         state, command = window.states[:, j], window.commands[:, j]
