@@ -334,6 +334,17 @@ def test_current_of_a_standing_joint_ends_the_motion_of_another_one(rig, monkeyp
     assert rig.guide.readings < 65
 
 
+@pytest.mark.parametrize(("cable", "duty"), [(MIDDLE + 300, 0.3), (MIDDLE - 300, -0.3)])
+def test_cable_of_a_joint_without_stops_is_in_its_way_on_its_own_side(cable, duty):
+    wrist = mechanics_of("wrist_roll", *SO101["wrist_roll"], MIDDLE)
+    wrist.cable = cable
+    assert wrist.advance(MIDDLE, 0.0, 0.0, 1.0) == (MIDDLE, 0.0), "it is slack in the middle pose"
+    pulled, _ = wrist.advance(MIDDLE, 0.0, duty, 5.0)
+    free, _ = wrist.advance(MIDDLE, 0.0, -duty, 5.0)
+    assert 300 < abs(pulled - MIDDLE) < 600
+    assert abs(free - MIDDLE) > 2000
+
+
 def test_arm_that_moves_by_itself_is_refused(rig):
     servo = rig.emulator.servos[1]
     watch = rig.emulator.on_request

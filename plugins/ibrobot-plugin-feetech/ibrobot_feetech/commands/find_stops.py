@@ -83,7 +83,7 @@ _CLEAR_LOAD = 25
 GRAVITY: Mapping[str, int] = {"shoulder_lift": 1, "elbow_flex": 1, "wrist_flex": 1}
 """Joint of an SO-101 -> sign of the torque of its weight in the middle pose, of an arm that stands upright."""
 _ORDER = ("gripper", "wrist_roll", "wrist_flex", "elbow_flex", "shoulder_lift", "shoulder_pan")
-"""From the light end of the arm to its foot, so that heavy joints move last, with the others in the middle pose."""
+"""From the gripper to the base: joints that carry most move last, with the others in the middle pose."""
 _STANCES: Mapping[str, Mapping[str, float]] = {
     "elbow_flex": {"shoulder_lift": -0.4, "wrist_flex": -1.6},
     "shoulder_lift": {"elbow_flex": -1.6},

@@ -42,7 +42,8 @@ class Mechanics:
     level: float = 2048.0
     """Where the lever is horizontal."""
     cable: float | None = None
-    """Where a cable is taut, which then pulls back; above the middle of the stops it is in the way upwards."""
+    """Where a cable is taut, which then pulls back; above the middle of the stops, or `level` of a joint that has none,
+    it is in the way upwards."""
     cable_stiffness: float = 0.002
     """[of stall torque per tick]"""
     sticky: tuple[float, float, float] | None = None
@@ -79,7 +80,8 @@ class Mechanics:
         load = self.gravity * math.cos((encoder - self.level) / TICKS_PER_RADIAN)
         load += _STOP * (max(0.0, self.low - encoder) - max(0.0, encoder - self.high))
         if self.cable is not None:
-            upwards = self.cable > (self.low + self.high) / 2
+            middle = (self.low + self.high) / 2
+            upwards = self.cable > (middle if math.isfinite(middle) else self.level)
             taut = encoder - self.cable if upwards else self.cable - encoder
             load -= math.copysign(self.cable_stiffness * max(0.0, taut), 1.0 if upwards else -1.0)
         if self.hand is not None:
