@@ -264,6 +264,7 @@ JSON = {
     "agent status --json": 2,
     "camera list --json": 0,
     "camera calibrate BAD --json": 2,
+    "camera mount BAD no_episode --json": 2,
     "explain EPISODE --json": 0,
     "explain BAD --json": 2,
     "datasets check BAD --json": 2,

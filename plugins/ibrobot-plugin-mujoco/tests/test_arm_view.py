@@ -70,7 +70,7 @@ def test_calibrated_camera_sees_what_the_one_of_the_scene_sees(config):
         (None, info(), "unknown where camera top is"),
         (Mount(parent="world"), None, "is not calibrated"),
         (Mount(parent="world"), info(0.0), "is not calibrated"),
-        (Mount(parent="shelf"), info(), "its parent shelf is no body of the MJCF"),
+        (Mount(parent="shelf"), info(), "its parent shelf is neither a link nor a body of the MJCF"),
     ],
 )
 def test_what_is_missing_is_named(config, mount, said, says):
