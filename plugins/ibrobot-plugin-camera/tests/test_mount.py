@@ -82,7 +82,12 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", BAD)
+SLOW = ("names exchanged", "parallel joints exchanged", "reversed", "large squares", "small squares",
+        "an arm that lies", "half of them wrong")  # fmt: skip
+"""Sessions of which the search tries many explanations."""
+
+
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=[pytest.mark.long] * (kind in SLOW)) for kind in BAD])
 def test_a_session_that_cannot_tell_is_refused_with_the_reason(tmp_path: Path, kind: str) -> None:
     options, reason = BAD[kind]
     with pytest.raises(SensorError, match=reason):
