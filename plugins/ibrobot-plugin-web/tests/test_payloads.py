@@ -164,8 +164,9 @@ def test_the_status_has_what_an_agent_asked_for_last_that_moves_the_robot() -> N
     for request, goal in requests:
         with pytest.raises(IbrobotError, match="may not move the robot"):
             authority.call(agent, "/planning/go_to", request)
-        found = agents_json(session, agents)["asked"]
-        assert found == {**asked, "goal": goal, "request": json.dumps(request)[:300]}
+        found, text = agents_json(session, agents)["asked"], json.dumps(request)
+        more = f" … and {len(text) - 300} characters more" if len(text) > 300 else ""
+        assert found == {**asked, "goal": goal, "request": text[:300] + more}
     json.dumps(agents_json(session, agents), allow_nan=False)
     agents.close()
     with pytest.raises(IbrobotError):
