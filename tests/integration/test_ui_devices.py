@@ -61,7 +61,8 @@ def test_an_arm_is_calibrated_on_the_page(tmp_path: Path, monkeypatch: pytest.Mo
         guides = {each["name"]: each for each in (await server.get("devices/list"))["guides"]}
         order = ["ports", "port", "motors", "calibration", "servos", "cameras", "lens"]
         assert [name for name in guides if name in order] == order  # as a person sets up an arm
-        assert [each["name"] for each in guides["calibration"]["questions"]] == ["port", "leader", "name", "zero_at", "auto"]
+        questions = [each["name"] for each in guides["calibration"]["questions"]]
+        assert questions == ["port", "leader", "name", "zero_at", "auto"]
         for wrong, why in (({"zero_at": "noon"}, "is not one of"), ({"leader": "yes"}, "must be a bool")):
             with pytest.raises(RuntimeError, match=why):
                 await server.post("devices/start", name="calibration", answers={"port": emulator.port, **wrong})
