@@ -30,6 +30,22 @@ WORDS = {
 }  # fmt: skip
 
 
+BEFORE_A_CLICK = """async () => {
+  const { Agents } = await import(new URL("agents.js", document.querySelector('script[src$="app.js"]').src));
+  const section = document.createElement("section");
+  const made = new Agents(section, { operating: true }, null);
+  const sees = (asked) => {
+    const agents = { connected: ["1:a"], armed: "", left_s: 0, speed: null, ended: "", asked };
+    made.update({ agents, services: ["/agent/arm"], faults: [] });
+    return section.querySelector("form button").disabled;
+  };
+  const first = sees(null);
+  made.readable = 0;
+  return [first, sees(null), sees({ agent: "1:a", service: "/x", request: "", refused: true, goal: "" })];
+}"""
+"""Whether the button that lets an agent move waits: at first, after a moment, and for a new request."""
+
+
 class AgentOverHttp:
     """An agent that calls from a thread of its own."""
 
@@ -102,6 +118,7 @@ def test_person_sees_what_an_agent_asks_for_lets_it_move_and_takes_that_back(
         refused = agent.call("go_to", goal="shoulder_pan=1.5")
         assert "may not move the robot" in refused.content[0].text
         agents.get_by_text(asks).wait_for()
+        assert page.evaluate(BEFORE_A_CLICK) == [True, False, True]
         agents.get_by_role("button", name=show).click()
         page.locator(".toasts").get_by_text(takes).wait_for()
         assert abs(pan(page)) < 0.02, "nothing has moved"

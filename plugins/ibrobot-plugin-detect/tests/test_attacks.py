@@ -79,8 +79,8 @@ PLACE = pose_at((0.1, 0.2, 0.3))
         ),
         ([Detection("cup", None)], "'cup': "),  # type: ignore[arg-type]
         ([Detection(3, PLACE)], "its name is 3"),  # type: ignore[arg-type]
-        ([None], "found None"),
-        (None, "found None"),
+        ([None], "its result has None"),
+        (None, "its result is None"),
         ([Detection("cup", PLACE)] * 2_000, "2000 objects, at most 1000"),
     ],
 )

@@ -4,6 +4,8 @@ import { h, refresh, say } from "./dom.js";
 
 const ARM = "/agent/arm";
 const DISARM = "/agent/disarm";
+// Nothing is granted by a click that was meant for what stood there before.
+const READ_MS = 1000;
 
 export class Agents {
   constructor(section, page, motion) {
@@ -19,10 +21,22 @@ export class Agents {
     this.section.hidden = !services.includes(ARM);
     if (this.section.hidden) return;
     const { connected, armed, asked } = agents;
+    const shown = JSON.stringify([connected, asked]);
+    if (shown !== this.shown) {
+      this.shown = shown;
+      this.readable = performance.now() + READ_MS;
+      setTimeout(() => this.enable(), READ_MS + 20);
+    }
     say(this.facts, line(agents));
     this.facts.classList.toggle("warning", Boolean(armed));
     refresh(this.asked, asked, () => this.request(asked));
     refresh(this.controls, [connected, armed, faults.length, page.operating], () => (armed ? this.disarm() : this.arm(connected, faults.length)));
+    this.enable();
+  }
+
+  // A new request has to stand for a moment before a click allows it.
+  enable() {
+    if (this.button) this.button.disabled = this.blocked || performance.now() < this.readable;
   }
 
   // What an agent asks for, and its path before it moves.
@@ -45,9 +59,10 @@ export class Agents {
     const agent = h("select", { "aria-label": "Agent" }, connected.map((name) => h("option", { value: name }, name)));
     if (connected.includes(this.agent)) agent.value = this.agent;
     agent.addEventListener("change", () => { this.agent = agent.value; });
+    this.blocked = !page.operating || stopped > 0;
+    this.button = h("button", { class: "primary" }, "Let the agent move");
     const form = h("form", { class: "row" }, agent, field("seconds", "For how many seconds", "3600"), "s",
-      field("speed", "Percent of its speed", "100"), "%",
-      h("button", { class: "primary", disabled: !page.operating || stopped > 0 }, "Let the agent move"));
+      field("speed", "Percent of its speed", "100"), "%", this.button);
     form.addEventListener("submit", (event) => {
       event.preventDefault();
       page.call(ARM, { agent: agent.value, seconds: Number(this.seconds), speed: Number(this.speed) / 100, by: "page" });
