@@ -32,13 +32,11 @@ from ibrobot_testing import control_context
 
 from ibrobot_core.api import EpisodeSetup, Vector, resolve_path
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests/shared"))
+from arm_moves import TICK_NS, moves
+
 ROBOT = so101()
-TICK_NS = 10_000_000
 ENCODER_RAD = 2 * np.pi / 4096
-MIDDLE = (0.0, -0.6, 0.2, 0.0, 0.0, 0.6)
-"""About where the arm moves [rad], clear of the table."""
-REACH, SMALL = 0.45, 0.05
-"""How far it goes from there, and the small motions [rad]."""
 ALLOWED = 0.10
 
 
@@ -60,24 +58,6 @@ def planted(seed: int) -> ArmParameters:
     joints["elbow_flex"] = attrs.evolve(joints["elbow_flex"], kp=4.5)
     joints["wrist_roll"] = attrs.evolve(joints["wrist_roll"], backlash=0.04)
     return attrs.evolve(published, delay=0.024, joints=joints)
-
-
-def moves(seconds: float, seed: int) -> Vector:
-    """Commands, shape (N, 6)."""
-    rng = np.random.default_rng(seed)
-    count = round(seconds * 1e9 / TICK_NS)
-    columns = []
-    for middle in MIDDLE:
-        here, row = 0.0, list[float]()
-        while len(row) < count:
-            there = here + rng.choice((-SMALL, SMALL)) if rng.random() < 0.35 else middle + rng.uniform(-REACH, REACH)
-            steps = max(8, round(abs(there - here) / rng.choice((0.15, 0.6, 2.5)) * 100))
-            share = np.linspace(0, 1, steps)
-            row += list(here + (there - here) * share * share * (3 - 2 * share))
-            row += [there] * int(rng.integers(5, 60))
-            here = there
-        columns.append(row[:count])
-    return np.array(columns).T
 
 
 def recorded(parameters: ArmParameters, commands: Vector) -> Recording:

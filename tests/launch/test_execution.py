@@ -40,7 +40,8 @@ def test_a_prompt_is_there_where_the_policy_wants_one(
     assert "takes no prompt" not in caplog.text
 
 
-def test_prompt_of_a_request_stands_in_for_that_of_the_yaml(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+def need_prompts(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the policy take a prompt."""
     runs.start().stop()
     make = runs.parts.Net.__init__
 
@@ -49,6 +50,10 @@ def test_prompt_of_a_request_stands_in_for_that_of_the_yaml(runs: Runs, monkeypa
         self.spec = attrs.evolve(self.spec, prompt=True)
 
     monkeypatch.setattr(runs.parts.Net, "__init__", wants_a_prompt)
+
+
+def test_prompt_of_a_request_stands_in_for_that_of_the_yaml(runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    need_prompts(runs, monkeypatch)
     runtime = runs.start(mode="teleop")
     with pytest.raises(ComponentFailed, match=r"control_modes\.policy\.inference\.prompt: is missing"):
         runtime.switch_mode("policy")
@@ -65,14 +70,7 @@ def test_prompt_of_a_request_to_a_policy_that_takes_none_is_said(runs: Runs, cap
 
 
 def test_policy_mode_is_entered_with_another_prompt(runs: Runs, monkeypatch: pytest.MonkeyPatch):
-    runs.start().stop()
-    make = runs.parts.Net.__init__
-
-    def wants_a_prompt(self: Any, *arguments: Any, **options: Any) -> None:
-        make(self, *arguments, **options)
-        self.spec = attrs.evolve(self.spec, prompt=True)
-
-    monkeypatch.setattr(runs.parts.Net, "__init__", wants_a_prompt)
+    need_prompts(runs, monkeypatch)
     runtime = runs.start("control_modes.policy.inference.prompt=pick", "contract.max_duration_s=100", seed=13)
     bus = runtime.session.bus
     answers = bus.subscribe(MODEL_ANSWERS, 100)

@@ -66,7 +66,7 @@ def installed_causes() -> Installed:
 def _mistakes(cause: object, descriptor: CauseDescriptor) -> Iterator[str]:
     """What keeps a cause of another package from being used."""
     if not isinstance(cause, Cause):
-        yield f"make returned {cause!r}, which is no Cause"
+        yield f"make returned {cause!r}, must be a Cause"
         return
     given = {name: value for base in reversed(type(cause).__mro__) for name, value in vars(base).items()}
     given |= vars(cause)

@@ -286,7 +286,7 @@ MISTAKES = {
     NeedsSomethingElse: "it needs measured; available: answers, ",
     ExplainsATuple: r"its explains are no frozenset of texts: \('plan_dry',\)",
     unfinished: "it cannot be made: NotImplementedError",
-    dict: "make returned {}, which is no Cause",
+    dict: "make returned {}, must be a Cause",
     Late("squeaks_nowhere:Squeaks"): "it cannot be made: ModuleNotFoundError: No module named 'squeaks_nowhere'",
     AnswersTremble: "its name is 'answers_tremble', and the type of its descriptor 'squeaks': give both one name",
 }

@@ -16,7 +16,7 @@ from ibrobot_feetech.commands.joints import SO101, by_servo, joints_of
 from ibrobot_feetech.commands.measure import Answers
 from ibrobot_feetech.emulator.mechanics import Mechanics, mechanics_of
 from ibrobot_feetech.ticks import TICKS_PER_RADIAN
-from ibrobot_terminal import Guide
+from ibrobot_terminal.fakes import FakeGuide
 from ibrobot_terminal.guide import Cells
 
 from ibrobot_core.api import CalibrationError, HardwareError, IbrobotError
@@ -33,11 +33,11 @@ SAVED = (
 )  # fmt: skip
 
 
-class Operator(Guide):
+class Operator(FakeGuide):
     """An operator who watches the table, and may end a wait at a reading."""
 
     def __init__(self) -> None:
-        self.said: list[str] = []
+        super().__init__()
         self.readings = 0
         self.at: dict[int, Callable[[], None]] = {}
         """Reading -> what happens then."""
@@ -46,16 +46,12 @@ class Operator(Guide):
         """Beginning of a question -> the answer, if it is not yes."""
 
     @override
-    def say(self, text: str, *, warning: bool = False) -> None:
-        self.said.append(text)
-
-    @override
     def show(self, columns: Sequence[str], rows: Cells) -> None:
         raise AssertionError
 
     @override
     def confirm(self, question: str, *, flag: str = "", default: bool = False) -> bool:
-        self.said.append(question)
+        super().confirm(question)
         return next((answer for begin, answer in self.answers.items() if question.startswith(begin)), True)
 
     @override

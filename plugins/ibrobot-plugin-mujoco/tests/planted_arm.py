@@ -6,6 +6,7 @@ from pathlib import Path
 
 import attrs
 import numpy as np
+from arm_moves import TICK_NS
 from ibrobot_mujoco.hardware import MujocoHardware
 from ibrobot_mujoco.identification.recordings import Recording
 from ibrobot_mujoco.options import MujocoOptions
@@ -17,12 +18,9 @@ from ibrobot_testing import control_context
 from ibrobot_core.api import EpisodeSetup, Vector, resolve_path
 
 ROBOT = so101()
-TICK_NS = 10_000_000
 STEP_S = 0.005
 """Of the physics, so that tests are short."""
 PUBLISHED = read_parameters(resolve_path("package://ibrobot_mujoco/servos/so101_sts3215.yaml", Path()), ROBOT)
-MIDDLE = (0.0, -0.6, 0.2, 0.0, 0.0, 0.6)
-"""About where the arm moves [rad], clear of the table."""
 TICK_RAD = 2 * np.pi / 4096
 """Resolution of an STS3215's encoder [rad]."""
 
@@ -46,26 +44,6 @@ def simulated(parameters: ArmParameters, folder: Path, **more: object) -> Mujoco
     hardware.connect()
     hardware.reset(EpisodeSetup(0))
     return hardware
-
-
-def moves(seconds: float, seed: int = 0, reach: float = 0.45) -> Vector:
-    """Commands above the table that show everything: fast and slow, wide and small, with pauses, shape (N, 6)."""
-    rng = np.random.default_rng(seed)
-    count = round(seconds * 1e9 / TICK_NS)
-    columns = []
-    for joint in range(6):
-        middle = MIDDLE[joint]
-        here, row = 0.0, list[float]()
-        while len(row) < count:
-            is_small = rng.random() < 0.35
-            there = here + rng.choice((-1, 1)) * 0.05 if is_small else middle + rng.uniform(-reach, reach)
-            steps = max(8, round(abs(there - here) / rng.choice((0.15, 0.6, 2.5)) * 100))
-            share = np.linspace(0, 1, steps)
-            row += list(here + (there - here) * share * share * (3 - 2 * share))
-            row += [there] * int(rng.integers(5, 60))
-            here = there
-        columns.append(row[:count])
-    return np.array(columns).T
 
 
 def recorded(hardware: MujocoHardware, commands: Vector, name: str = "planted", encoder: float = TICK_RAD) -> Recording:

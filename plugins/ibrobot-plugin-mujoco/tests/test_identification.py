@@ -7,6 +7,7 @@ from pathlib import Path
 import attrs
 import numpy as np
 import pytest
+from arm_moves import moves
 from ibrobot_mujoco.identification.contents import contents_of, lines_of, read_contents, write_report
 from ibrobot_mujoco.identification.findings import findings_of
 from ibrobot_mujoco.identification.fit import ARM
@@ -16,7 +17,7 @@ from ibrobot_mujoco.parameters import JointParameters, read_parameters
 
 from ibrobot_core.api import DatasetError, Vector
 
-from .planted_arm import PUBLISHED, ROBOT, STEP_S, moves, planted, recorded, simulated
+from .planted_arm import PUBLISHED, ROBOT, STEP_S, planted, recorded, simulated
 
 PLANTED = planted(
     0.024, every={"damping": 0.8, "frictionloss": 0.08, "kp": 11.0},

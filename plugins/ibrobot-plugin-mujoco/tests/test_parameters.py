@@ -7,6 +7,7 @@ from pathlib import Path
 import attrs
 import numpy as np
 import pytest
+from arm_moves import moves
 from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_mujoco.identification.simulation import FedArm, with_backlash
@@ -19,7 +20,7 @@ from ibrobot_mujoco.setpoints import Servos
 from ibrobot_core.api import HardwareError
 from ibrobot_core.app import ConfigError, load_config
 
-from .planted_arm import PUBLISHED, ROBOT, STEP_S, moves, planted, recorded, simulated
+from .planted_arm import PUBLISHED, ROBOT, STEP_S, planted, recorded, simulated
 
 NAMES = ROBOT.joint_names
 _positive = st.floats(1e-3, 1e3)
