@@ -207,7 +207,9 @@ def test_services_have_rows_or_move_nothing() -> None:
     assert unknown(found, NAMED, STILL_SERVICES) == []
     assert unknown(STILL_SERVICES, found) == [], "there is no such service"
     assert unknown(computed, OTHER_SERVICES) == []
-    assert unknown({name for name in NAMED if name[0] == "/"}, found, {"/cmd_pose"}) == [], "there is no such service"
+    assert unknown({name for name in NAMED if name[0] == "/"}, found, {"/cmd_pose", "/cmd_goal"}) == [], (
+        "there is no such service"
+    )
 
 
 def test_topics_that_are_read_have_rows_or_move_nothing() -> None:

@@ -1,4 +1,4 @@
-"""Every goal of the documentation, by page, service, program, task and command line: all plan the same."""
+"""Every goal of the documentation, by page, service, program, task, command line and ROS: all plan the same."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import queue
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,17 @@ import yaml
 from command_line import run_here
 from ibrobot_kinematics.path_constraints import CONSTRAINT_KEYS
 from ibrobot_planning.client import Client
+from ibrobot_planning.execution.motions import commanded
 from ibrobot_planning.execution.requests import PlanAhead
 from ibrobot_planning.execution.services import PLAN_GOAL
+from ibrobot_planning.execution.source import CMD_GOAL, MOTION_STATUS
 from ibrobot_planning.tasks.reading import read_task
 from ibrobot_planning.world.objects import World
+from ibrobot_ros2 import decode, encode
 from ibrobot_web.commands import Commands
 from ibrobot_web.messages import Sent, from_page
 
-from ibrobot_core.api import JointTrajectory, PlanningError
+from ibrobot_core.api import JointTrajectory, PlanningError, String
 from ibrobot_core.app import LaunchRequest, Runtime, Session, find_config, installed_plugins, load_config
 
 pytestmark = pytest.mark.integration
@@ -52,8 +56,8 @@ def documented_goals() -> list[str]:
     return goals
 
 
-@pytest.fixture(scope="module")
-def run() -> Iterator[Runtime]:
+@contextmanager
+def at_rest() -> Iterator[Runtime]:
     """A simulated SO-101 at rest in its pose `rest`."""
     registry = installed_plugins()
     overrides = ("simulation.scene=empty", "simulation.start_pose=rest", PLANNER)
@@ -66,6 +70,13 @@ def run() -> Iterator[Runtime]:
         yield runtime
     finally:
         runtime.stop()
+
+
+@pytest.fixture(scope="module")
+def run() -> Iterator[Runtime]:
+    """A run in which nothing moves."""
+    with at_rest() as runtime:
+        yield runtime
 
 
 def by_page(run: Runtime, goal: str) -> Answer:
@@ -139,12 +150,37 @@ def by_command(goal: str) -> Answer:
     return answer["message"] or (list(answer["goal_joints"].values())[:5], answer["duration_s"])
 
 
+def by_ros(goal: str) -> list[float] | None:
+    """Positions where the arm comes to rest after a message as ROS sends it [rad]; None if it does not move."""
+    with at_rest() as run:
+        bus = run.session.bus
+        seen = bus.subscribe(MOTION_STATUS, 1000)
+        before = commanded(run.session)
+        bus.publish(CMD_GOAL, decode(String.ros_type, encode(String(goal))))
+        came: list[str] = []
+        for _ in range(3000):
+            run.step()
+            came += [each.message.data for each in seen.drain() if isinstance(each.message, String)]
+            if came[-1:] in (["succeeded"], ["failed"]):
+                break
+        reached = commanded(run.session)
+        seen.close()
+    if came[-1] == "succeeded":
+        return reached[:5].tolist()
+    np.testing.assert_array_equal(reached, before)
+    return None
+
+
 @pytest.mark.parametrize("goal", documented_goals())
 def test_every_entrance_plans_the_same(run: Runtime, goal: str) -> None:
     answer = by_service(run, goal)
     assert by_program(run, goal) == answer
     if not ("xyz" in goal and "gripper" in goal):  # two steps of a task
         assert by_task(run, goal) == answer
+    reached = by_ros(goal)
+    assert (reached is None) == isinstance(answer, str)
+    if reached is not None:
+        np.testing.assert_allclose(reached, answer[0], atol=2e-3)
     for other in (by_page(run, goal), by_command(goal)):
         if isinstance(answer, str) or isinstance(other, str):
             assert other == answer

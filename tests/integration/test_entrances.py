@@ -44,6 +44,7 @@ ADAPTERS: Mapping[str, Callable[[], Entrance]] = {
     "/moveit_gateway/move_to_configuration": entrances.MoveToConfiguration,
     "/execute_trajectory": entrances.Execute,
     "/cmd_pose": entrances.CmdPose,
+    "/cmd_goal": entrances.CmdGoal,
     "/task/run": entrances.Task,
     "/task/step": entrances.TaskStep,
     "ibrobot mcp": entrances.Agent,

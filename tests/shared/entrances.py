@@ -39,7 +39,7 @@ from ibrobot_web.messages import Sent, from_page, from_server, to_run
 from ibrobot_webxr.messages import Hands, decode
 from plugin_tests import of_tests
 
-from ibrobot_core.api import Header, Pose, PoseStamped, Twist, TwistStamped, Vector3, ns
+from ibrobot_core.api import Header, Pose, PoseStamped, String, Twist, TwistStamped, Vector3, ns
 from ibrobot_core.channel import Channel
 from ibrobot_core.config import RobotConfig, from_document, load_config
 from ibrobot_core.errors import IbrobotError
@@ -369,6 +369,22 @@ class CmdPose(MoveToPose):
     @override
     def with_time(self, off_s: float) -> object:
         return self.publish(self.pose, self.run.session.clock.now_ns() + ns(off_s))
+
+
+class CmdGoal(Entrance):
+    """`/cmd_goal`."""
+
+    def publish(self, value: float) -> None:
+        """Publish a goal in words."""
+        self.run.session.bus.publish("/cmd_goal", String(f"shoulder_pan={value}"))
+
+    @override
+    def ask(self) -> object:
+        return self.publish(FAR)
+
+    @override
+    def with_number(self, value: float) -> Iterator[Callable[[], object]]:
+        yield lambda: self.publish(value)
 
 
 class Task(Entrance):

@@ -12,9 +12,20 @@ import numpy as np
 import pytest
 from ibrobot_planning.execution.requests import PlanAnswer
 from ibrobot_planning.execution.services import PLAN_GOAL
-from ibrobot_planning.execution.source import CMD_POSE, EXECUTE, GO_TO, MOVE_TO_CONFIGURATION, RESULT
+from ibrobot_planning.execution.source import CMD_GOAL, CMD_POSE, EXECUTE, GO_TO, MOVE_TO_CONFIGURATION, RESULT
 
-from ibrobot_core.api import Header, JointTrajectory, Message, PlanningError, Pose, PoseStamped, Quaternion, Vector3, ns
+from ibrobot_core.api import (
+    Header,
+    JointTrajectory,
+    Message,
+    PlanningError,
+    Pose,
+    PoseStamped,
+    Quaternion,
+    String,
+    Vector3,
+    ns,
+)
 from ibrobot_core.app import PlanCode, Runtime
 
 from .conftest import Make
@@ -72,28 +83,35 @@ def test_pose_of_the_present_moves_the_arm(run, age_s: float | None):
     assert steps(runtime) > 0.1
 
 
-@pytest.mark.parametrize("message", [POSE, PoseStamped(Header(0, "base"), POSE)], ids=["Pose", "PoseStamped"])
-def test_pose_that_waited_moves_nothing(run, message: Message):
+@pytest.mark.parametrize(
+    "message",
+    [POSE, PoseStamped(Header(0, "base"), POSE), String("pan=0.3")],
+    ids=lambda message: type(message).__name__,
+)
+def test_goal_on_a_topic_that_waited_moves_nothing(run, message: Message):
     runtime = run()
-    runtime.session.bus.publish(CMD_POSE, message)
+    runtime.session.bus.publish(CMD_GOAL if isinstance(message, String) else CMD_POSE, message)
     runtime.session.clock.advance(ns(0.6))  # e.g. while another goal was planned
     assert steps(runtime) == 0
 
 
-def test_pose_older_than_a_stop_moves_nothing(run, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize(("topic", "message"), [(CMD_POSE, POSE), (CMD_GOAL, String("pan=0.3"))])
+def test_goal_on_a_topic_older_than_a_stop_moves_nothing(
+    run, topic: str, message: Message, monkeypatch: pytest.MonkeyPatch
+):
     """Also if it is read only after the reset has begun the mode."""
     runtime = run()
     source: Any = runtime.session.command_source
-    runtime.session.bus.publish(CMD_POSE, POSE)
+    runtime.session.bus.publish(topic, message)
     runtime.session.emergency_stop()
     assert steps(runtime, 2) == 0
-    runtime.session.bus.publish(CMD_POSE, POSE)
+    runtime.session.bus.publish(topic, message)
     with monkeypatch.context() as patch:
-        patch.setattr(source._poses, "drain", list)
+        patch.setattr(source, "_drain", lambda: None)
         runtime.reset()
     source._era = 0, 0
     assert steps(runtime) == 0
-    runtime.session.bus.publish(CMD_POSE, POSE)
+    runtime.session.bus.publish(topic, message)
     assert steps(runtime) > 0.1
 
 

@@ -17,6 +17,7 @@ from ibrobot_planning.execution.results import MoveResult, Results
 from ibrobot_planning.execution.services import CARTESIAN, COMPUTE_FK, COMPUTE_IK, PLAN
 from ibrobot_planning.execution.source import (
     CANCEL,
+    CMD_GOAL,
     CMD_POSE,
     GO_TO,
     MOTION_STATUS,
@@ -222,6 +223,34 @@ def test_wrong_cmd_pose_moves_nothing(run, message, expected: str, caplog: pytes
     for _ in range(20):
         runtime.step()
     assert f"/cmd_pose: {expected}" in caplog.text
+    np.testing.assert_array_equal(command(runtime), before)
+
+
+def test_cmd_goal_is_a_goal_in_words(run):
+    runtime = run()
+    runtime.session.bus.publish(CMD_GOAL, String("pan=0.3"))
+    for _ in range(200):
+        runtime.step()
+    np.testing.assert_allclose(command(runtime)[0], 0.3, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "goal '': a goal is a pose's name, joints, e.g. "),
+        ("pann=0.3", "goal 'pann=0.3': no joint 'pann'; the joints are: pan, "),
+        ("pan=nan", "goal 'pan=nan': 'nan' is not an angle in radians"),
+        ("pan=0.3\n" * 1_000_000, "goal has 8000000 characters, at most 1000 are read"),
+    ],
+)
+def test_wrong_cmd_goal_moves_nothing(run, text: str, expected: str, caplog: pytest.LogCaptureFixture):
+    runtime = run()
+    before = command(runtime)
+    runtime.session.bus.publish(CMD_GOAL, String(text))
+    for _ in range(20):
+        runtime.step()
+    assert f"/cmd_goal: INVALID_GOAL_CONSTRAINTS: {expected}" in caplog.text
+    assert len(caplog.text) < 10_000
     np.testing.assert_array_equal(command(runtime), before)
 
 

@@ -19,6 +19,7 @@ from ibrobot_core.app import (
     GoalRun,
     NoRequest,
     PlanCode,
+    Received,
     RequestLimits,
     Service,
     SourceWorker,
@@ -100,6 +101,8 @@ MOVE_TO_CONFIGURATION = Service(
 )
 CMD_POSE = "/cmd_pose"
 """geometry_msgs/msg/PoseStamped or Pose: a goal."""
+CMD_GOAL = "/cmd_goal"
+"""std_msgs/msg/String: a goal in words, as `--goal`."""
 MOTION_STATUS = "/moveit_gateway/motion_status"
 """std_msgs/msg/String: `idle`, `executing`, `succeeded` or `failed`, as in IB-Robot's gateway."""
 _STATUS_NS = ns(0.1)
@@ -142,7 +145,7 @@ class PlannerSource(SourceWorker):
     """Moves to goals, planned from the robot's present position.
 
     The goals of the request are reached one after the other, in the mode in which the run begins. A goal from a service
-    or `/cmd_pose` replaces all others; its motion blends with the one under way. A motion stops if something blocks it.
+    or a topic replaces all others; its motion blends with the one under way. A motion stops if something blocks it.
 
     Raises:
         PlanningError: for an invalid goal of the request.
@@ -172,7 +175,7 @@ class PlannerSource(SourceWorker):
         """Set to end the watching thread."""
         self._last_state: ControlState | None = None
         self._era = 0, 0
-        """Numbers of the emergency stops and of the generation that `/cmd_pose` was last read in."""
+        """Numbers of the emergency stops and of the generation that topics of goals were last read in."""
         for goal in session.request.goals if session.state is None else ():
             try:
                 self._queue.append(self._new(goal, asked=True))
@@ -200,8 +203,12 @@ class PlannerSource(SourceWorker):
         door = door_of(self.session)
         self._execution = Execution(self.session, planner, door)
         door.watched_by = self._execution.follows
-        self._poses = self.session.bus.subscribe(CMD_POSE, 1, PoseStamped, Pose)
-        self.on_end.callback(self._poses.close)
+        self._topics = {
+            CMD_POSE: self.session.bus.subscribe(CMD_POSE, 1, PoseStamped, Pose),
+            CMD_GOAL: self.session.bus.subscribe(CMD_GOAL, 1, String),
+        }
+        for subscription in self._topics.values():
+            self.on_end.callback(subscription.close)
         self.on_end.callback(self._drop_all)
         planner.load()
         if not self.session.request.lockstep:
@@ -215,7 +222,7 @@ class PlannerSource(SourceWorker):
     def begin_mode(self, seed: int) -> None:
         if self._move is not None:
             self._finish(self._move, "EXECUTION_FAILED", PlanCode.CONTROL_FAILED, "control was reset")
-        self._poses.drain()
+        self._drain()
         self._era = self.session.stops, self.session.generation
         self._forget()
         for service, handler in self._services.items():
@@ -265,7 +272,7 @@ class PlannerSource(SourceWorker):
                     self._replace(item)
             if not self.active:
                 return
-            self._take_pose()
+            self._take_topics()
             if self.session.request.lockstep:
                 self._watch()
             if self._move is not None:
@@ -375,34 +382,43 @@ class PlannerSource(SourceWorker):
             pass
         return move.result or _ENDED
 
-    def _take_pose(self) -> None:
-        """Move to a pose that has come, unless it is older than a stop or a reset, or too old or too new by its time.
+    def _drain(self) -> None:
+        for subscription in self._topics.values():
+            subscription.drain()
 
-        A pose without a time counts as made when it came, so that one that waited, e.g. for a long plan, is dropped.
+    def _take_topics(self) -> None:
+        """Move to a goal that has come, unless it is older than a stop or a reset, or too old or too new by its time.
+
+        One without a time counts as made when it came, so that one that waited, e.g. for a long plan, is dropped.
         """
         session = self.session
         era, self._era = self._era, (session.stops, session.generation)
         if era != self._era:
-            self._poses.drain()
-        received = self._poses.get()
-        if received is None:
-            return
-        message = received.message
-        try:
-            stamp_ns = 0
-            if isinstance(message, PoseStamped):
-                check_frame(message.header.frame_id)
-                stamp_ns, message = message.header.stamp_ns, message.pose
-            self._check_time(stamp_ns or received.received_ns)
-            if not isinstance(message, Pose):
-                raise PlanningError(
-                    f"takes geometry_msgs/msg/PoseStamped or Pose, got {message.ros_type}",
-                    PlanCode.UNRECOGNIZED_GOAL_TYPE,
-                )
-            self._replace(self._new(_nearest(message), stops=self._era[0]))
-        except PlanningError as error:
-            self._errors(f"{CMD_POSE} {error.code.name}", f"{CMD_POSE}: {error.code.name}: {error}")
-            self._show("failed")
+            self._drain()
+        for topic, subscription in self._topics.items():
+            if (received := subscription.get()) is None:
+                continue
+            try:
+                self._replace(self._new(self._goal_in(received), stops=self._era[0]))
+            except PlanningError as error:
+                self._errors(f"{topic} {error.code.name}", f"{topic}: {error.code.name}: {error}")
+                self._show("failed")
+
+    def _goal_in(self, received: Received) -> str | Goal:
+        """The goal of a message.
+
+        Raises:
+            PlanningError: if its frame or its time is not that of the robot.
+        """
+        message, stamp_ns = received.message, 0
+        if isinstance(message, PoseStamped):
+            check_frame(message.header.frame_id)
+            stamp_ns, message = message.header.stamp_ns, message.pose
+        self._check_time(stamp_ns or received.received_ns)
+        if isinstance(message, String):
+            return message.data
+        assert isinstance(message, Pose), "the bus refuses other types on these topics"
+        return _nearest(message)
 
     def _replace(self, move: _Move | None) -> None:
         """Replace all goals by `move`; None: hold."""

@@ -33,6 +33,8 @@ _SIZES = {
 _WORDS = {"beyond_reach": POLICIES, "axis": tuple(DIRECTIONS), "upright_axis": AXES, "view_axis": AXES}
 """Keys with words -> the words."""
 _KEYS = (*dict.fromkeys((*_SIZES, *_WORDS)),)
+_LONGEST = 1000
+"""Characters of a goal, as of a text in a request to a service."""
 _EXAMPLES = "joints, e.g. wrist_flex=0.5, or a position, e.g. xyz=0.2,0.0,0.1"
 
 
@@ -73,6 +75,8 @@ def target(goal: str | Goal | Target, robot: Robot, velocity_scaling: float = 1.
     if isinstance(goal, NamedGoal):
         goal = goal.name
     if isinstance(goal, str):
+        if len(goal) > _LONGEST:
+            raise invalid_goal(f"goal has {len(goal)} characters, at most {_LONGEST} are read")
         try:
             tool, joints, constraints = _parsed(goal.strip(), robot)
         except (PlanningError, ValueError) as error:
