@@ -10,7 +10,8 @@ import numpy as np
 from ibrobot_diagnose.card import Card, make_card
 from ibrobot_diagnose.cause import Diagnosis, Reference
 from ibrobot_diagnose.diagnosis import diagnose
-from ibrobot_diagnose.rig import Rig, RigCamera, Still, rig_of
+from ibrobot_diagnose.recorded_rig import rig_of
+from ibrobot_diagnose.rig import Rig, RigCamera, Still
 from ibrobot_diagnose.window import Window
 from made_runs import HOME, JOINTS, Run, window_of
 from numpy.typing import NDArray

@@ -29,8 +29,7 @@ from ibrobot_core.api import (
     Transport,
 )
 from ibrobot_core.app import FrameAssembler, RobotConfig, build_policy, from_document, installed_plugins
-from ibrobot_diagnose.cause import Shown
-from ibrobot_diagnose.pictures import reddened
+from ibrobot_diagnose.pictures import Shown, reddened
 from ibrobot_diagnose.window import Asked, Floats, Window
 
 ACTION = "action"

@@ -20,7 +20,8 @@ from ibrobot_core.api import Contract, DatasetError
 from ibrobot_diagnose.alignment import shift_of
 from ibrobot_diagnose.course import delay_of
 from ibrobot_diagnose.pictures import SMALL, Grey, background, descriptors, grey, nearest, png, read_png
-from ibrobot_diagnose.rig import Rig, rig_of
+from ibrobot_diagnose.recorded_rig import rig_of
+from ibrobot_diagnose.rig import Rig
 from ibrobot_diagnose.window import Camera, Floats, Limits, Window
 
 FILE = "reference.json"

@@ -13,11 +13,9 @@ import attrs
 from ibrobot_core.api import Descriptor, Options
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from ibrobot_diagnose.ask_again import Examined
     from ibrobot_diagnose.card import Card
+    from ibrobot_diagnose.pictures import Shown
     from ibrobot_diagnose.window import Window
 
 KIND = "cause"
@@ -53,15 +51,6 @@ OWN_NAMES = frozenset({
 })  # fmt: skip
 """Names of the causes of this package, which no other can have. Discovery needs them, and imports no cause."""
 type Verdict = Literal["ok", "warn", "fail", "cannot tell"]
-
-
-@attrs.frozen(eq=False)
-class Shown:
-    """A picture of a finding."""
-
-    title: str
-    picture: NDArray[np.uint8]
-    """Shape (H, W, 3)."""
 
 
 _text: Any = attrs.validators.instance_of(str)

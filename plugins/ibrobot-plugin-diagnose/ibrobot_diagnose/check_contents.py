@@ -12,9 +12,9 @@ from ibrobot_provenance.report_page import as_page
 from ibrobot_provenance.reports import Case, Cases, Fix, ReportSection, Table, Text
 from ibrobot_provenance.svg import tag
 
-from ibrobot_diagnose.cause import Shown
 from ibrobot_diagnose.contents import figures, read_facts, read_sections
 from ibrobot_diagnose.options import CHECK
+from ibrobot_diagnose.pictures import Shown
 
 _ROOM_S = 0.2
 """Time that stays before the motion begins, and after it ends [s]."""

@@ -16,9 +16,9 @@ from ibrobot_provenance.reports import Case, Cases, Plots, ReportSection, Table,
 from ibrobot_provenance.svg import axis_of, caption, grid_below, grid_beside, svg, tag
 
 from ibrobot_core.api import DatasetError
-from ibrobot_diagnose.cause import Finding, Shown
+from ibrobot_diagnose.cause import Finding
 from ibrobot_diagnose.options import REPORT
-from ibrobot_diagnose.pictures import png
+from ibrobot_diagnose.pictures import Shown, png
 from ibrobot_diagnose.report import Explanation
 from ibrobot_diagnose.window import Floats
 

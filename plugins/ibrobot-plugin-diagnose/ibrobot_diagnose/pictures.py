@@ -45,6 +45,15 @@ class Picture:
     """Share of the pixels that are white."""
 
 
+@attrs.frozen(eq=False)
+class Shown:
+    """A picture of a finding."""
+
+    title: str
+    picture: NDArray[np.uint8]
+    """Shape (H, W, 3)."""
+
+
 def grey(picture: NDArray[np.generic]) -> Grey:
     """Grey values from 0 to 255, shape (H, W)."""
     result: Grey = picture.astype(np.float32) @ _WEIGHTS

@@ -25,7 +25,8 @@ from ibrobot_core.api import (
     TopicSummary,
 )
 from ibrobot_core.app import Received, RunView, installed_plugins
-from ibrobot_diagnose.rig import Rig, rig_of
+from ibrobot_diagnose.recorded_rig import rig_of
+from ibrobot_diagnose.rig import Rig
 from ibrobot_diagnose.window import Window, read_window
 
 SETTLE_S = 1.0

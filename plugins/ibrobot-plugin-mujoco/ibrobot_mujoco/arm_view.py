@@ -39,7 +39,9 @@ class ArmView:
         size: height and width of the pictures to draw [px].
 
     Raises:
-        NotSupported: if the place of the camera, its calibration, or a model of the arm is missing; says which.
+        NotSupported: if the place of the camera, its calibration, a model of the arm, or a joint in it is missing; says
+            which.
+        HardwareError: if the simulated scene cannot be built.
         MissingDependency: if this machine cannot render.
     """
 
@@ -102,6 +104,9 @@ def _mounted(config: RobotConfig, camera: str, info: CameraInfo | None) -> tuple
         spec = several_arms(path, arms) if (arms := config.robot.description.arms) else read_mjcf(path).spec.copy()
     except KinematicsError as error:
         raise NotSupported(str(error)) from None
+    known = [joint.name for joint in spec.joints]
+    if missing := [name for name in config.robot.joint_names if name not in known]:
+        raise NotSupported(f"{path} has no joint {missing[0]!r}; it has: {', '.join(known) or 'none'}")
     try:
         body, link = _carried(spec, path, config, mount.parent)
     except KinematicsError as error:

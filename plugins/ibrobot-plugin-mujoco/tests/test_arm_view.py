@@ -82,3 +82,12 @@ def test_robot_without_a_model_is_named(config):
     robot = attrs.evolve(config.robot, description=attrs.evolve(config.robot.description, mjcf=None))
     with pytest.raises(NotSupported, match=r"set robot\.description\.mjcf"):
         ArmView(attrs.evolve(real(config, Mount(parent="world")), robot=robot), "top", info(), SIZE)
+
+
+@pytest.mark.parametrize("parent", ["world", "gripper", "moving_jaw_so101_v1_link"])
+@pytest.mark.parametrize("joint", ["shoulder_pan", "gripper"])
+def test_joint_that_the_mjcf_lacks_is_named(config, parent, joint):
+    joints = tuple(attrs.evolve(each, name="hip") if each.name == joint else each for each in config.robot.joints)
+    robot = attrs.evolve(config.robot, joints=joints)
+    with pytest.raises(NotSupported, match=r"has no joint 'hip'; it has: shoulder_pan, "):
+        ArmView(attrs.evolve(real(config, Mount(parent=parent)), robot=robot), "top", info(), SIZE)

@@ -19,10 +19,10 @@ from ibrobot_diagnose.card import (
     repeated_of,
     still,
 )
-from ibrobot_diagnose.cause import CardCause, Cause, Evidence, Reference, Shown, likelihood
+from ibrobot_diagnose.cause import CardCause, Cause, Evidence, Reference, likelihood
 from ibrobot_diagnose.causes.moved import FAILS, WARNS, Sight, sights
 from ibrobot_diagnose.looks import Looks
-from ibrobot_diagnose.pictures import descriptors, nearest, resized
+from ibrobot_diagnose.pictures import Shown, descriptors, nearest, resized
 from ibrobot_diagnose.rig import Rig
 from ibrobot_diagnose.window import COMPARED, Camera, Window
 

@@ -14,9 +14,10 @@ from ibrobot_provenance.jobs import Job, open_pool
 from ibrobot_core.api import DatasetError, RecorderError
 from ibrobot_core.app import Emit, Unsuccessful, echo, wrong_input
 from ibrobot_diagnose.card import Card, Maker
-from ibrobot_diagnose.cause import Reference, Shown
+from ibrobot_diagnose.cause import Reference
 from ibrobot_diagnose.diagnosis import diagnose
 from ibrobot_diagnose.options import CheckOptions, CheckProgress, CheckReport
+from ibrobot_diagnose.pictures import Shown
 from ibrobot_diagnose.references import find_episodes, read_episode
 from ibrobot_diagnose.report import finding_facts
 from ibrobot_diagnose.window import Window
