@@ -24,9 +24,6 @@ class _Owned:
     executor: Executor
     columns: NDArray[np.intp]
 
-    def reading(self, measured: JointReading) -> JointReading:
-        return measured.of(self.columns)
-
 
 class ActiveExecutors:
     """The active executors of a robot; joints without an active executor do not move.
@@ -35,7 +32,7 @@ class ActiveExecutors:
         robot: the robot.
         executors: name -> executor.
         report: called with a `goal` event whenever the state of a goal changes.
-        rest: returns where the joints come to rest if they brake now [rad], shape (J,).
+        rest: returns where the joints come to rest if they brake now [rad], shape (J,); without torque, where they are.
 
     Attributes:
         want_relax: whether an executor requested torque off at the last `update`.
@@ -57,16 +54,19 @@ class ActiveExecutors:
         return bool(self._active)
 
     def enter(self, names: Iterable[str], measured: JointReading) -> None:
-        """Activate the executors of a mode at the measured positions."""
+        """Activate the executors of a mode where the joints come to rest.
+
+        Those are not the measured positions: a loaded arm would sink a little each time, and a gripper let go.
+        """
         self._active = [self._all[name] for name in names]
         self._streamed.clear()
         for owned in self._active:
-            owned.executor.activate(owned.reading(measured))
+            owned.executor.activate(self._at_rest(owned, measured))
 
     def leave(self, measured: JointReading) -> None:
         """Deactivate all executors and cancel their goals."""
         for owned in self._active:
-            owned.executor.cancel(owned.reading(measured))
+            owned.executor.cancel(measured.of(owned.columns))
             self._report_goals(owned)
             owned.executor.deactivate()
         self._active = []
@@ -89,7 +89,7 @@ class ActiveExecutors:
         setpoints = []
         self.want_relax = False
         for owned in self._active:
-            setpoint = owned.executor.update(owned.reading(measured))
+            setpoint = owned.executor.update(measured.of(owned.columns))
             shape = owned.columns.shape
             if not isinstance(setpoint, np.ndarray) or setpoint.dtype != np.float64 or setpoint.shape != shape:
                 wanted = f"expected setpoints [rad]: a float64 array of shape {shape}"
@@ -116,7 +116,7 @@ class ActiveExecutors:
         if owned is None:
             active = ", ".join(each.name for each in self._active)
             raise GoalRejected(f"executor {executor!r} is not active; active: {active or 'none'}")
-        reading = self._at_rest(owned, measured) if isinstance(goal, SlowDown) else owned.reading(measured)
+        reading = self._at_rest(owned, measured) if isinstance(goal, SlowDown) else measured.of(owned.columns)
         try:
             owned.executor.set_goal(goal_id, goal, reading)
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
@@ -127,7 +127,7 @@ class ActiveExecutors:
         """Cancel the goal of an executor, or all goals if it is empty; the executors then hold."""
         for owned in self._active:
             if executor in ("", owned.name):
-                owned.executor.cancel(owned.reading(measured))
+                owned.executor.cancel(measured.of(owned.columns))
 
     def counters(self) -> dict[str, dict[str, int]]:
         """The counters of all executors, including inactive ones."""
@@ -141,8 +141,8 @@ class ActiveExecutors:
         return reading.position
 
     def _at_rest(self, owned: _Owned, measured: JointReading) -> JointReading:
-        """A reading whose positions are where the joints come to rest if they brake now."""
-        return attrs.evolve(owned.reading(measured), position=self._rest()[owned.columns])
+        """A reading whose positions are those of `rest`."""
+        return attrs.evolve(measured.of(owned.columns), position=self._rest()[owned.columns])
 
     def _report_goals(self, owned: _Owned) -> None:
         while (status := owned.executor.pop_status()) is not None:

@@ -111,7 +111,7 @@ class ControlCore:
         self.fault = ""
         self.events: deque[Mapping[str, Any]] = deque()
         """Events for the host, of kinds `goal`, `fault` and `guard`."""
-        self._executors = ActiveExecutors(config.robot, executors, self.events.append, lambda: self._safety.rest)
+        self._executors = ActiveExecutors(config.robot, executors, self.events.append, self._rest)
         self.state: ControlState | None = None
         """Readings and commands of the last tick; None before the first."""
 
@@ -161,7 +161,7 @@ class ControlCore:
             return self.phase is not Phase.ARRIVING
         measured = self._readings.newest
         away = np.abs(measured.position - self._pose.target)
-        # The mode starts from the measured positions; those of an old reading would pull the robot back.
+        # The mode starts at the pose; the joints must be there, by a reading that is not old.
         if self._pose.reached and not measured.stale and away.max() <= _POSE_TOLERANCE:
             self._pose.end()
             self._advance(Cause.ARRIVED)
@@ -477,6 +477,10 @@ class ControlCore:
             self._advance(Cause.FAULT)
             self._leave()
             self._pose.end()
+
+    def _rest(self) -> Vector:
+        """Where the joints come to rest if they brake now [rad], shape (J,); without torque, where they are."""
+        return self._readings.newest.position if self._relaxed else self._safety.rest
 
     def _leave(self) -> None:
         """Deactivate all executors; without one, every joint brakes and holds."""

@@ -100,7 +100,7 @@ class Executor(ABC):
 
     @abstractmethod
     def activate(self, measured: JointReading) -> None:
-        """Take over the joints at `measured`, shape (J,) in the order of `joints`, and hold there."""
+        """Take over the joints, shape (J,) in the order of `joints`, and hold at `measured`: where the commands rest."""
 
     @abstractmethod
     def update(self, measured: JointReading) -> Vector:

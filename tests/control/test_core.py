@@ -54,20 +54,44 @@ class TestStart:
 
 
 class TestModes:
-    def test_a_switch_changes_owners_within_a_tick_and_holds_what_is_measured(self, make_rig):
+    def test_switches_change_owners_within_a_tick_and_let_no_loaded_joint_sink(self, make_rig):
         rig = make_rig({}).start()
         rig.plan([0.4, 0.5, 0.6])
-        rig.tick(60)
-        rig.tick(100)
-        rig.hardware._position[1] -= 0.05  # it sags
-        rig.tick()
-        answer = rig.call(SwitchMode(mode="plan"))
+        rig.tick(160)
+        command = rig.core.state.command
+        for mode in ("plan", "plan", "stream"):
+            rig.hardware._position[1] -= 0.05  # its load pulls it down
+            rig.tick()
+            answer = rig.call(SwitchMode(mode=mode))
+            assert answer["generation"] == rig.core.generation
+            np.testing.assert_allclose(rig.tick(60).command, command, atol=1e-9)
 
-        assert answer["generation"] == rig.core.generation
-        rig.tick(60)
-        sagged = rig.hardware._position[1]
-        np.testing.assert_allclose(rig.core.state.command[1], 0.45, atol=0.01)
-        assert sagged == pytest.approx(0.45, abs=0.01)
+    def test_switch_without_torque_begins_where_the_joints_are(self, make_rig, monkeypatch):
+        relaxes = {"type": "position", "stale_timeout": 0.1, "safety_behavior": "relax"}
+        executors = {
+            "arm_position": {**relaxes, "group": "arm"},
+            "gripper_position": {**relaxes, "group": "gripper"},
+            "arm_trajectory": {"type": "waypoints", "group": "arm"},
+            "gripper_action": {"type": "waypoints", "group": "gripper"},
+        }
+        rig = make_rig({"executors": executors}).start()
+        rig.plan([0.4, 0.5, 0.6])
+        rig.tick(160)
+        assert rig.hardware.relaxed
+        last = rig.hardware.read()
+        position = last.position.copy()
+
+        def read():
+            return attrs.evolve(last, stamp_ns=rig.clock.now_ns(), position=position.copy())
+
+        monkeypatch.setattr(rig.hardware, "read", read)
+        for _ in range(20):
+            position[1] -= 0.02  # it falls
+            rig.tick()
+        rig.call(SwitchMode(mode="plan"))
+
+        assert rig.tick(20).command[1] == pytest.approx(position[1], abs=0.001)
+        assert not rig.hardware.relaxed
 
     def test_a_switch_on_the_move_stays_within_the_limits(self, make_rig):
         rig = make_rig({}).start()

@@ -234,6 +234,16 @@ def test_grant_lets_a_robot_that_holds_go_on(run: AgentRun) -> None:
     assert run.moved(400) > 1.0
 
 
+def test_arm_does_not_sink_by_grants_and_their_ends(run: AgentRun) -> None:
+    before = run.commands[-1]
+    for _ in range(3):
+        run.grant()
+        run.ticks(5)
+        run.session.bus.call(DISARM)
+        run.ticks(20)
+    np.testing.assert_allclose(run.commands[-1], before, atol=1e-9)
+
+
 def test_stop_ends_the_authority_and_a_reset_does_not_give_it_back(run: AgentRun) -> None:
     run.grant()
     run.go()
