@@ -7,6 +7,7 @@ import threading
 from pathlib import Path
 from typing import Any, override
 
+import attrs
 import numpy as np
 import pytest
 from ibrobot_kinematics.clearance import CLEARANCE
@@ -51,6 +52,9 @@ def options(text: str = YAML) -> WorldOptions:
     return single_options(WorldOptions, (), "world", text=text)
 
 
+SIDES = {"left_": (0.0, 0.3, 0.0, 0.0), "right_": (0.0, -0.3, 0.0, 0.0)}
+
+
 class TestWorldKeeper(SectionSuite):
     @override
     def component(self, session):
@@ -78,6 +82,43 @@ def test_shapes_are_those_of_objects_in_the_base_frame(run) -> None:
         "pen": ("capsule", (0.005, 0.1)),
         "wall": ("plane", ()),
     }
+
+
+@pytest.fixture
+def both(tmp_path, monkeypatch):
+    """A session with the world, of two arms at zero."""
+    robot = make_robot(tmp_path)
+    joints = [attrs.evolve(each, name=f"{side}{each.name}") for side in SIDES for each in robot.joints]
+    described = attrs.evolve(robot.description, arms=SIDES, poses={})
+    session = make_session(robot=attrs.evolve(robot, joints=tuple(joints), groups={}, description=described))
+    reading = type("Reading", (), {"position": np.zeros(12)})()
+    monkeypatch.setattr(session, "measured", lambda: reading)
+    keeper = WorldKeeper(options(), session)
+    keeper.start()
+    yield session.bus
+    keeper.stop()
+
+
+def test_the_hands_of_both_arms_may_touch_named_objects_and_what_each_carries(both) -> None:
+    both.call(ATTACH, {"name": "ball", "link": "right_hand"})
+    both.call(TOUCH, {"objects": ["can"]})
+    hands = {f"{side}{link}" for side in SIDES for link in ("hand", "finger")}
+    assert both.call(SNAPSHOT).objects["can"].may_touch == {"table", "ball"} | hands
+    both.call(TOUCH, {"objects": []})
+    assert both.call(SNAPSHOT).objects["can"].may_touch == {"table"}
+
+
+def test_which_of_two_hands_carries_an_object_has_to_be_said(both) -> None:
+    with pytest.raises(PlanningError, match=r"attach 'ball': say which link carries it, .* several hands.*left_hand"):
+        both.call(ATTACH, {"name": "ball"})
+
+
+def test_no_object_is_put_down_farther_away_than_objects_may_be(run) -> None:
+    run.call(ATTACH, {"name": "ball", "link": "hand"})
+    run.call("/world/move", {"name": "ball", "position": [1000, 1000, 1000], "rpy": [0.5, 0.5, 0.5]})
+    with pytest.raises(PlanningError, match="1000 m away"):
+        run.call(DETACH, {"name": "ball"})
+    assert run.call(SNAPSHOT).objects["ball"].link == "hand"
 
 
 def test_objects_come_from_the_yaml(run):

@@ -16,7 +16,7 @@ from ibrobot_planning.guard.changes import WorldChange
 from ibrobot_planning.guard.pairs import Pairs
 from ibrobot_planning.world.arm import Arm
 from ibrobot_planning.world.coal_shapes import geometry
-from ibrobot_planning.world.objects import Boxes, Voxels, World
+from ibrobot_planning.world.objects import Boxes, Voxels, World, WorldObject
 
 _MOST_WAITING = 32
 """Worlds that wait for a loop that takes none, e.g. since the robot holds after a fault; then one takes their place."""
@@ -39,14 +39,15 @@ class Finished:
 class Building:
     """Takes changes of the world in, in order, and puts what is finished into `finished`.
 
-    Objects that the arm cannot have, e.g. on a link that is not there, are left out, each with a warning.
+    While the world has an object that the guard cannot check, e.g. on a link that is not there, it is not known well
+    enough.
 
     Args:
         arm: the arm.
         permit: adds to a world what the guard knows besides, and what may be touched.
         make: makes the pairs of such a world, with parts of those of the world before, if there are any.
         pairs: those of the world without objects.
-        log: for objects that are left out.
+        log: for objects that cannot be checked.
         in_thread: whether to build in a thread; else in `add`, as stepped time needs it.
     """
 
@@ -72,7 +73,9 @@ class Building:
         self.old: deque[Pairs] = deque()
         """Those that the loop has no more: freeing them takes longer than it has time."""
         self.changes = self.refused = 0
-        """Number of changes, and of objects that were left out."""
+        """Number of changes, and of objects that could not be checked."""
+        self._unusable: dict[str, str] = {}
+        """Those that the world has now, and why."""
 
     def add(self, change: WorldChange) -> None:
         """Have a change taken in."""
@@ -102,11 +105,15 @@ class Building:
             self.old.popleft().let_go()
         world = self._world
         for change in changes:
-            usable = {name: thing for name, thing in change.changed.items() if self._is_usable(name, change)}
+            unusable = {name: why for name, thing in change.changed.items() if (why := self._fault(name, thing))}
+            for name in (*change.removed, *change.changed):
+                self._unusable.pop(name, None)
+            self._unusable |= unusable
+            usable = {name: thing for name, thing in change.changed.items() if name not in unusable}
             world = attrs.evolve(change, changed=usable).apply(world)
         self._world = world
         self.changes += len(changes)
-        stale = changes[-1].stale
+        stale = changes[-1].stale or next(iter(self._unusable.values()), "")
         try:
             world = self._permit(world)
             change = WorldChange.between(self._made, world)
@@ -126,14 +133,22 @@ class Building:
         else:
             self._made = world
 
-    def _is_usable(self, name: str, change: WorldChange) -> bool:
-        thing = change.changed[name]
+    def _fault(self, name: str, thing: WorldObject) -> str:
+        """Why an object cannot be checked; empty if it can."""
         try:
             World({name: thing}).check(self._arm.frames)
             if not isinstance(thing.shape, Voxels | Boxes):
                 geometry(thing.shape)
         except (PlanningError, ValueError, RuntimeError) as error:
             self.refused += 1
-            self._log.warning("the guard leaves an object out: %s: %s", name, error)
-            return False
-        return True
+            fault = f"the guard cannot check object {name!r}: {error}"
+            self._log.error("%s; the world counts as too old until it is removed or replaced", fault)
+            return fault
+        return ""
+
+    def take(self) -> Finished | None:
+        """The oldest world that is finished and not taken over yet."""
+        try:
+            return self.finished.popleft()
+        except IndexError:  # without a look before: a world that takes the place of those that wait removes them
+            return None

@@ -13,12 +13,11 @@ import numpy as np
 from ibrobot_core.api import HardwareError, Pose, Quaternion, Vector3
 from ibrobot_planning.guard.meshes import is_large
 from ibrobot_planning.world.objects import SIMPLE, Boxes, Mesh, Shape, Voxels, World, WorldObject
+from ibrobot_planning.world.options import FURTHEST
 
 _NAMES: Mapping[type[Any], str] = {kind: name for name, kind in SIMPLE.items()}
 _CELLS, _FEWER_CELLS = ("<i2", "<i8"), 2**15
 """Types of the indices of cells; the first suffices below a limit, and control reads it in a quarter of the time."""
-_FARTHEST_M = 1000.0
-"""Positions farther away are mistakes, and the distances to them are not computed well."""
 _NEARLY_ONE = 1e-3
 """Allowed deviation of a quaternion's length from 1."""
 
@@ -120,7 +119,7 @@ def _written_pose(pose: Pose) -> list[float]:
 def _read_pose(values: Sequence[Any]) -> Pose:
     x, y, z, qx, qy, qz, qw = map(float, values)
     # Written so that NaN fails it.
-    if not all(abs(each) <= _FARTHEST_M for each in (x, y, z)):
+    if not all(abs(each) <= FURTHEST for each in (x, y, z)):
         raise ValueError(f"a position of {x:g}, {y:g}, {z:g} m")
     if not abs(math.hypot(qx, qy, qz, qw) - 1) <= _NEARLY_ONE:
         raise ValueError(f"a quaternion of length {math.hypot(qx, qy, qz, qw):.3g}, must be 1")

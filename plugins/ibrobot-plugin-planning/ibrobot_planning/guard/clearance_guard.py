@@ -127,8 +127,8 @@ class ClearanceGuard(Guard):
         """As `accept`, of the joints of the model."""
         self._joints.note(measured)
         self._begin = self._joints.path(position[None])[0]
-        while self._building.finished:
-            self._take(self._building.finished.popleft())
+        while (finished := self._building.take()) is not None:
+            self._take(finished)
         self._note(position, measured)
         self._pairs.left = _MOST
         step = velocity * self._period_s

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from itertools import product
 
 import attrs
 import numpy as np
-from ibrobot_kinematics import robot_model
-from ibrobot_kinematics.errors import KinematicsError
 from ibrobot_kinematics.poses import matrix
 
 from ibrobot_core.api import Pose, Robot, Vector, Vector3
 from ibrobot_planning.guard.options import ClearanceGuardOptions, RegionOptions
 from ibrobot_planning.world.arm import Arm, Pair, sorted_pair
 from ibrobot_planning.world.coal_shapes import enclosing, geometry
+from ibrobot_planning.world.hands import hands
 from ibrobot_planning.world.objects import FLOOR, Boxes, Mesh, Plane, Voxels, World, WorldObject
 
 _OTHER_FLOOR = f"{FLOOR} of the world"
@@ -23,20 +22,6 @@ _ROUNDING_M = 1e-6
 """How far an object in a region may reach beyond it [m]."""
 _CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 """Of a cube of length 1."""
-
-
-def hands(robot: Robot, arm: Arm) -> tuple[str, ...]:
-    """The links behind the last joint that moves the tool, of each arm; none for a model without the tool."""
-    prefixes = tuple(robot.description.arms) or ("",)
-    links: list[str] = []
-    for prefix in prefixes:
-        joints = [name for name in robot.joint_names if robot.description.arm_of(name) == prefix]
-        try:
-            model = robot_model(robot, joints)
-        except KinematicsError:  # e.g. a tip of the URDF alone
-            continue
-        links += arm.hand(model.joint_names[model.chain[-1].index]) if model.chain else ()
-    return tuple(links)
 
 
 class Permissions:
@@ -61,30 +46,55 @@ class Permissions:
 
     def applied(self, world: World) -> World:
         """A world with the table, and with what may be touched without limit."""
-        others = {_OTHER_FLOOR if name in self._fixed else name: thing for name, thing in world.objects.items()}
-        objects = {**self._fixed, **others}
-        return World({name: thing for given in objects.items() for name, thing in self._permitted(*given)})
+        objects = dict(self._fixed)
+        for name, thing in world.objects.items():
+            own = name
+            if self._fixed and name in (FLOOR, _OTHER_FLOOR):
+                own = _OTHER_FLOOR if name == FLOOR else _new_name(name, world.objects)
+            objects |= self._permitted(name, own, thing, world.objects.keys())
+        return World(objects)
 
-    def _permitted(self, name: str, thing: WorldObject) -> Iterator[tuple[str, WorldObject]]:
-        """An object with what may touch it; cells that lie in a region are an object of their own."""
+    def _permitted(
+        self, name: str, own: str, thing: WorldObject, taken: Collection[str]
+    ) -> Iterator[tuple[str, WorldObject]]:
+        """An object with what may touch it; the cells that lie in the same regions are an object of their own.
+
+        Args:
+            name: its name in the world.
+            own: its name in the guard, unless it is divided.
+            thing: the object.
+            taken: names of other objects.
+        """
         free = self._options.free
         if free is not None:
-            thing = _touchable(thing, free.get(FLOOR if name == _OTHER_FLOOR else name, ()))
+            thing = _touchable(thing, free.get(name, ()))
         elif thing.movable:
             thing = _touchable(thing, self._hands)
-        for region, box in self._options.regions.items() if thing.link is None else ():
-            links = self._hands if box.links is None else box.links
-            inside = _within(thing, box)
-            if not isinstance(thing.shape, Voxels):
-                thing = _touchable(thing, links) if inside.all() else thing
-            elif inside.any():
-                cells = thing.shape.cells
-                within = attrs.evolve(thing, shape=Voxels(thing.shape.size, cells[inside]))
-                yield f"{name} in {region}", _touchable(within, links)
-                if inside.all():
-                    return
-                thing = attrs.evolve(thing, shape=Voxels(thing.shape.size, cells[~inside]))
-        yield name, thing
+        if thing.link is not None or not self._options.regions:
+            yield own, thing
+            return
+        regions = list(self._options.regions.items())
+        lies_in = np.array([_within(thing, box) for _, box in regions])
+        divided = np.unique(lies_in, axis=1).T if isinstance(thing.shape, Voxels) else lies_in.all(axis=1)[None]
+        for each in divided.tolist():
+            within = [(region, box) for (region, box), is_in in zip(regions, each, strict=True) if is_in]
+            part = thing
+            if isinstance(thing.shape, Voxels):
+                cells = thing.shape.cells[(each == lies_in.T).all(axis=1)]
+                part = attrs.evolve(thing, shape=Voxels(thing.shape.size, cells))
+            for _, box in within:
+                part = _touchable(part, self._hands if box.links is None else box.links)
+            if within and isinstance(thing.shape, Voxels):
+                yield _new_name(f"{name} in {' and '.join(region for region, _ in within)}", taken), part
+            else:
+                yield own, part
+
+
+def _new_name(name: str, taken: Collection[str]) -> str:
+    """A name that no object has, since one would take the place of the other."""
+    while name in taken:
+        name += "'"
+    return name
 
 
 def _touchable(thing: WorldObject, by: Iterable[str]) -> WorldObject:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from ibrobot_core.api import PlanningError, Pose, Vector
 from ibrobot_core.app import Bus, NoRequest, PlanCode, Service
 from ibrobot_planning.world.ages import AgeSummary
+from ibrobot_planning.world.options import FURTHEST
 
 FLOOR = "floor"
 """Name of the object that the option `floor` of a planner adds."""
@@ -220,6 +221,8 @@ class WorldObject:
         p, o = self.pose.position, self.pose.orientation
         if not np.isfinite([p.x, p.y, p.z, o.x, o.y, o.z, o.w]).all():
             raise ValueError("the pose must be finite")
+        if max(abs(p.x), abs(p.y), abs(p.z)) > FURTHEST:
+            raise ValueError(f"the position is {p.x:g}, {p.y:g}, {p.z:g} m, at most {FURTHEST:g} m away")
         length = math.hypot(o.x, o.y, o.z, o.w)
         if abs(length - 1) > 1e-3:
             raise ValueError(f"the orientation is a quaternion of length {length:.3g}, must be 1")

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ibrobot_planning.world.objects import WorldObject
 
 FURTHEST = 1000.0
-"""Positions [m] and angles [rad] beyond this are refused as mistakes."""
+"""Positions [m] and angles [rad] beyond this are refused as mistakes; distances to them are not computed well."""
 _KEYS = {
     "box": ("size",),
     "sphere": ("radius",),

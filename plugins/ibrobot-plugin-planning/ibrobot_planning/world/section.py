@@ -26,6 +26,7 @@ from ibrobot_core.api import (
 )
 from ibrobot_core.app import Component, NoRequest, PlanCode, RobotConfig, RunView, Service, Subscription
 from ibrobot_planning.world.ages import Age, Limit, Unusable
+from ibrobot_planning.world.hands import hands
 from ibrobot_planning.world.objects import (
     FLOOR,
     OBSERVED,
@@ -281,7 +282,7 @@ class WorldKeeper(Component):
         """The world with what the hand may touch for now."""
         if not self._touched:
             return world
-        hand = frozenset(self._hand())
+        hand = frozenset(hands(self._session.config.robot, self._arm))
         carried = {name for name, thing in world.objects.items() if thing.link in hand}
         objects = dict(world.objects)
         for name in (name for name in self._touched if name in objects):
@@ -423,7 +424,7 @@ class WorldKeeper(Component):
 
     def _attach(self, world: World, it: Attached) -> World:
         self._no_cloud(it.name)
-        hand = self._hand() if it.link is None else ()
+        hand = self._hand(it.name) if it.link is None else ()
         link = hand[0] if it.link is None else it.link
         placed = np.linalg.inv(self._link(link)) @ matrix(world.named(it.name).pose)
         return world.attach(it.name, link, pose(placed), frozenset((*hand, *it.may_touch)))
@@ -445,12 +446,21 @@ class WorldKeeper(Component):
 
         return robot_arm(self._session.config.robot)
 
-    def _hand(self) -> tuple[str, ...]:
-        """The links that the last joint of the tool carries."""
-        from ibrobot_kinematics import robot_model
+    def _hand(self, name: str) -> tuple[str, ...]:
+        """The links that the last joint of the tool carries.
 
-        model = robot_model(self._session.config.robot)
-        return self._arm.hand(model.joint_names[model.chain[-1].index])
+        Raises:
+            PlanningError: for a robot with several arms, or whose model has no tool: the request has to name the link.
+        """
+        robot = self._session.config.robot
+        links = hands(robot, self._arm)
+        if not links or len(robot.description.arms) > 1:
+            raise PlanningError(
+                f"attach {name!r}: say which link carries it, since robot {robot.name!r} has"
+                f" {'several hands' if links else 'no tool'}; the links are: {', '.join(links or self._arm.frames)}",
+                PlanCode.INVALID_LINK_NAME,
+            )
+        return links
 
     def _link(self, link: str) -> Vector:
         """Present pose of a link, shape (4, 4)."""
