@@ -95,14 +95,6 @@ from ibrobot_core.services import (
     NoRequest as NoRequest,
     RequestLimits as RequestLimits,
 )
-from ibrobot_core.launch.runtime import (
-    SET_MODE as SET_MODE,
-    SetMode as SetMode,
-    RESET as RESET,
-    Reset as Reset,
-    ESTOP as ESTOP,
-    CHECK_ESTOP as CHECK_ESTOP,
-)
 from ibrobot_core.launch.authority import AGENT_LOG as AGENT_LOG, Agent as Agent, Authority as Authority, Grant as Grant
 from ibrobot_core.interfaces.transport import HANDLER_THREADS as HANDLER_THREADS
 from ibrobot_core.interfaces.policy import (

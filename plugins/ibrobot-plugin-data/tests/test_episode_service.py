@@ -29,7 +29,7 @@ from ibrobot_data.errors import DiskFull
 from ibrobot_provenance.ownership import InUse, Ownership
 
 from ibrobot_core.api import Contract, IbrobotError, NotSupported, RecorderError
-from ibrobot_core.app import ESTOP, RESET, ConfigError, RequestError
+from ibrobot_core.app import ConfigError, RequestError
 
 if TYPE_CHECKING:
     from fake_runs import Runs
@@ -79,12 +79,12 @@ def test_unwritable_root_is_an_error_before_anything_starts(runs: Runs, root: st
 
 def test_no_episode_begins_before_an_emergency_stop_is_reset(run: Runtime, runs: Runs):
     bus = run.session.bus
-    bus.call(ESTOP, None)
+    bus.call("/estop")
     ticks(run, 3)
     with pytest.raises(RecorderError, match=r"^not recording: emergency stop; reset it first$"):
         bus.call(START, "pick the cube")
     ticks(run, 50)
-    bus.call(RESET, None)
+    bus.call("/reset")
     ticks(run, 3)
     bus.call(START, "pick the cube")
     assert bus.call(STATUS).recording

@@ -11,7 +11,7 @@ import pytest
 from fake_runs import finish, seconds
 from ibrobot_data.episode_dataset import count_complete
 
-from ibrobot_core.app import ESTOP, installed_plugins
+from ibrobot_core.app import installed_plugins
 
 if TYPE_CHECKING:
     from fake_runs import Runs
@@ -26,7 +26,7 @@ def records(folder: Path) -> list[dict[str, Any]]:
 def test_an_emergency_stop_ends_an_episode_at_once_as_a_failure(runs: Runs):
     runtime = runs.start(RECORDING, episodes=2)
     seconds(runtime, 0.2)
-    runtime.session.bus.call(ESTOP, None)
+    runtime.session.bus.call("/estop")
     seconds(runtime, 0.1)
     assert ("ended", 1, "failure") in runs.parts.EVENTS
     runtime.stop()

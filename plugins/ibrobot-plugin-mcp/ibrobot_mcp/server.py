@@ -23,7 +23,7 @@ from mcp.server.auth.provider import AccessToken
 from mcp.server.lowlevel.server import Server
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import SET_MODE, Agent, RequestError, RunView, error_text
+from ibrobot_core.app import Agent, RequestError, RunView, error_text
 from ibrobot_mcp.audit import authority_of
 from ibrobot_mcp.prompts import PROMPTS, prompt
 from ibrobot_mcp.resources import Resources
@@ -208,7 +208,7 @@ class AgentServer:
         if client is not None:
             client.session = ctx.session
             self._authority.renew(client.agent)
-        while not self._run.bus.serves(SET_MODE):  # the run starts, or ends
+        while not self._run.bus.serves("/set_mode"):  # the run starts, or ends
             await asyncio.sleep(_START_S)
         if ctx.request_id is not None and ctx.method not in _COUNTED and (why := self._allowance(ctx).other()):
             raise MCPError(code=types.INTERNAL_ERROR, message=why)

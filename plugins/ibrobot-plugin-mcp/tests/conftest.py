@@ -14,7 +14,7 @@ from ibrobot_testing import make_session, stand_in
 from mcp import Client
 
 from ibrobot_core.api import option
-from ibrobot_core.app import SET_MODE, Grant, NoRequest, Service, Session
+from ibrobot_core.app import Grant, NoRequest, Service, Session
 
 
 @attrs.frozen
@@ -60,7 +60,7 @@ class Rig:
         self.session.control = cast("Any", SimpleNamespace(**control, stops=0))
         self.authority = self.session.authority
         bus = self.session.bus
-        bus.serve(stand_in(SET_MODE.name), lambda request: None)
+        bus.serve(stand_in("/set_mode"), lambda request: None)
         bus.serve(MOVE, self.move)
         bus.serve(RESULT, lambda request: f"motion {request.number} has ended")
         bus.serve(CANCEL, lambda request: self.moves.append("cancel"))

@@ -31,7 +31,7 @@ from mcp.client.streamable_http import streamable_http_client
 from mcp_types import Implementation
 
 from ibrobot_core.api import HardwareError, IbrobotError
-from ibrobot_core.app import SET_MODE, Component, RequestError, Session
+from ibrobot_core.app import Component, RequestError, Session
 
 from .conftest import Rig
 
@@ -45,7 +45,7 @@ def session_with_control() -> Session:
         "write_plan": lambda plan: None,
     }
     session.control = cast("Any", SimpleNamespace(**control, stops=0))
-    session.bus.serve(stand_in(SET_MODE.name), lambda request: None)
+    session.bus.serve(stand_in("/set_mode"), lambda request: None)
     return session
 
 

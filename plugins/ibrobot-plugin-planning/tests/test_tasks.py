@@ -20,7 +20,7 @@ from ibrobot_testing import SectionSuite
 from ibrobot_testing.fakes import FakePolicy
 
 from ibrobot_core.api import IbrobotError, PlanningError, String
-from ibrobot_core.app import SET_MODE, ConfigError, RequestError, Runtime
+from ibrobot_core.app import ConfigError, RequestError, Runtime
 
 from .conftest import Make
 from .test_motion import RATE_HZ, robot_yaml
@@ -277,13 +277,14 @@ def test_policy_is_given_the_prompt_of_the_step(run, before: str, prompt: str):
     runtime = run()
     runtime.switch_mode(before)
     given = []
-    runtime.session.bus.unserve(SET_MODE)
+    service = runtime.session.bus.services()["/set_mode"]
+    runtime.session.bus.unserve(service)
 
     def switch(request):
         given.append(request)
         return runtime.switch_mode(request.mode)
 
-    runtime.session.bus.serve(SET_MODE, switch)
+    runtime.session.bus.serve(service, switch)
     perform(runtime, steps(f"run_policy: {{mode: policy, seconds: 0.1, prompt: {prompt!r}}}"))
     entered = [("policy", prompt)] if prompt or before == "plan" else []
     assert [(each.mode, each.prompt) for each in given] == [*entered, ("plan", "")]

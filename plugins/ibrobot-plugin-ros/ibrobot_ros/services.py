@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from ibrobot_ros2.offers import TRIGGER, Offer, Offers
+from ibrobot_ros2.offers import CHECK, Offer, Offers
 from ibrobot_ros2.workers import StopWay, Workers
 
-from ibrobot_core.app import CHECK_ESTOP, ESTOP, Channel, ComponentFailed, RunView
+from ibrobot_core.app import Channel, ComponentFailed, RunView
 from ibrobot_ros.options import RosOptions
 from ibrobot_ros.topics import ros_name
 
@@ -19,7 +19,6 @@ _MOST = 1000
 """Most calls that wait."""
 _CHECK_S = 10.0
 """Longest wait for the answer to a stop that is only tried out [s]."""
-_CHECK = Offer(TRIGGER, CHECK_ESTOP.name, {})
 
 
 class Services:
@@ -44,12 +43,12 @@ class Services:
         self._workers[True] = Workers(lambda work: work(), "ros stop", _URGENT_WORKERS, way=self._way)
         self._way.open()
         answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-        self.submit(lambda: answers.put(self._found.answer(_CHECK, {})), urgent=True)
+        self.submit(lambda: answers.put(self._found.answer(CHECK, {})), urgent=True)
         try:
             answer = answers.get(timeout=_CHECK_S)
         except queue.Empty:
             answer = {"success": False, "message": f"no answer within {_CHECK_S:g} s"}
-        if self._session.bus.serves(ESTOP) and not answer["success"]:
+        if self._session.bus.serves("/estop") and not answer["success"]:
             raise ComponentFailed(f"an emergency stop from ROS would fail: {answer['message']}")
 
     def close(self) -> None:

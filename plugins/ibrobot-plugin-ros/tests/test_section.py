@@ -16,10 +16,11 @@ from ibrobot_ros.options import RosOptions
 from ibrobot_ros.section import RosNode
 from ibrobot_ros2 import decode, encode
 from ibrobot_ros2.offers import TRIGGER, Offer
+from ibrobot_testing import stand_in
 from ibrobot_testing.section import SectionSuite, make_session
 
 from ibrobot_core.api import Bool, Header, Image, JointState, MissingDependency, String
-from ibrobot_core.app import ESTOP, ComponentFailed, Session
+from ibrobot_core.app import ComponentFailed, Session
 
 from . import fake_node
 
@@ -202,8 +203,8 @@ def test_the_rest_is_sent_at_the_end(started, monkeypatch):
 def test_without_further_threads_stops_are_answered_and_other_calls_refused(started, monkeypatch):
     part = started()
     services, calls = part.node._services, []
-    part.session.bus.unserve(ESTOP)
-    part.session.bus.serve(ESTOP, lambda request: calls.append("estop"))
+    part.session.bus.unserve("/estop")
+    part.session.bus.serve(stand_in("/estop"), lambda request: calls.append("estop"))
     answers: queue.SimpleQueue[dict[str, object]] = queue.SimpleQueue()
     channel = SimpleNamespace(send=answers.put)
     services._offers = {"/estop": Offer(TRIGGER, "/estop", {}, urgent=True), "/slow": Offer(TRIGGER, "/slow", {})}

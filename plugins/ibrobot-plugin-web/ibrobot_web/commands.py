@@ -14,9 +14,7 @@ import attrs
 from ibrobot_core.api import IbrobotError, PlanningError, seconds
 from ibrobot_core.app import (
     PULSE_S,
-    RESET,
     Pulse,
-    Reset,
     RunView,
     error_text,
     raise_thread_priority,
@@ -223,7 +221,7 @@ def _run_times(session: RunView, *times_ms: int) -> list[int]:
 def _reset(session: RunView, sent: Sent[messages.Reset]) -> Any:
     if sent.stops is None:
         raise IbrobotError("this page has seen no state of the robot yet")
-    return session.bus.call(RESET, Reset(sent.stops))
+    return session.bus.call("/reset", {"stops": sent.stops})
 
 
 def _preview(session: RunView, sent: Sent[messages.Preview]) -> Mapping[str, Any]:

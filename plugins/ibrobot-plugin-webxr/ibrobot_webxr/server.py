@@ -21,7 +21,7 @@ from ibrobot_http.guard import Guard
 from ibrobot_http.server import ServerThread
 
 from ibrobot_core.api import Clock, RobotStatus
-from ibrobot_core.app import CHECK_ESTOP, ESTOP, Bus, NoRequest, Service, error_text
+from ibrobot_core.app import Bus, error_text
 from ibrobot_webxr.certificate import open_port, own_folder
 from ibrobot_webxr.exchange import Delays, Exchange
 from ibrobot_webxr.images import CameraImages
@@ -98,7 +98,7 @@ class PageServer:
         self._stops = ThreadPoolExecutor(1, "webxr stop")
         self._server: ServerThread | None = None
         try:
-            self._stops.submit(self._call_if_served, CHECK_ESTOP).result(_CHECK_S)
+            self._stops.submit(self._call_if_served, "/estop/check").result(_CHECK_S)
             self._server = ServerThread(self._guard, app, "webxr page", close_s=0.1, beside=self._send_states)
         except BaseException:
             self.close()
@@ -185,11 +185,11 @@ class PageServer:
         """Stop the robot, in any mode."""
         self.exchange.stop()
         try:
-            await asyncio.get_running_loop().run_in_executor(self._stops, self._call_if_served, ESTOP)
+            await asyncio.get_running_loop().run_in_executor(self._stops, self._call_if_served, "/estop")
         except Exception as error:  # noqa: BLE001 - contained: the device in `read` stops the robot, too
             self._log.error("webxr: the emergency stop failed: %s", error_text(error))
 
-    def _call_if_served(self, service: Service[NoRequest, Any]) -> None:
+    def _call_if_served(self, service: str) -> None:
         if self._bus.serves(service):
             self._bus.call(service)
 

@@ -17,7 +17,7 @@ import attrs
 import numpy as np
 import pytest
 from ibrobot_http.certificates import own_certificate
-from ibrobot_testing import host_context
+from ibrobot_testing import host_context, stand_in
 from ibrobot_testing.http import HttpSuite, Served
 from ibrobot_webxr.certificate import own_folder
 from ibrobot_webxr.options import WebxrOptions
@@ -36,7 +36,7 @@ from ibrobot_core.api import (
     TeleopError,
     ns,
 )
-from ibrobot_core.app import CHECK_ESTOP, ESTOP, Bus, NoRequest, operate
+from ibrobot_core.app import Bus, operate
 
 from .browser import Browser, hand, hands
 from .rig import ANY_PORT, BENT, page_of, robot_of
@@ -216,11 +216,11 @@ def test_a_page_that_opens_while_the_host_pauses_keeps_control(
 def test_the_stop_reaches_the_run_in_any_mode(ctx: Context, page: PageServer, browser: Browser):
     assert ctx.bus is not None
     stopped: list[object] = []
-    ctx.bus.serve(ESTOP, stopped.append)
+    ctx.bus.serve(stand_in("/estop"), stopped.append)
     browser.log_in().connect()
     browser.send({"type": "stop"})
     browser.state()
-    assert stopped == [NoRequest()]
+    assert stopped == [None]
 
 
 def test_buttons_reach_the_run(ctx: Context, teleop: WebxrTeleop, browser: Browser):
@@ -369,7 +369,7 @@ def test_a_certificate_that_does_not_fit_is_an_error(tmp_path: Path, ctx: Contex
 def test_a_stop_needs_no_thread_that_is_not_there_yet(ctx: Context, monkeypatch: pytest.MonkeyPatch):
     assert ctx.bus is not None
     called = threading.Event()
-    ctx.bus.serve(ESTOP, lambda request: called.set())
+    ctx.bus.serve(stand_in("/estop"), lambda request: called.set())
     server = PageServer(ANY_PORT, ctx.clock, ctx.bus, ctx.log)
     try:
         with monkeypatch.context() as patch:
@@ -388,9 +388,9 @@ def _refuse(thread: threading.Thread) -> None:
 def test_a_stop_that_would_fail_is_an_error_at_the_start(ctx: Context):
     assert ctx.bus is not None
 
-    def check(request: NoRequest) -> None:
+    def check(request: None) -> None:
         raise TeleopError("control does not answer")
 
-    ctx.bus.serve(CHECK_ESTOP, check)
+    ctx.bus.serve(stand_in("/estop/check"), check)
     with pytest.raises(TeleopError, match="control does not answer"):
         PageServer(ANY_PORT, ctx.clock, ctx.bus, ctx.log)

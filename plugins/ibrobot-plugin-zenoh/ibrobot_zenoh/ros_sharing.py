@@ -13,11 +13,11 @@ import attrs
 from ibrobot_ros2.calls import GoalRequest
 from ibrobot_ros2.goals import Actions, with_goals
 from ibrobot_ros2.interfaces import ActionType, ServiceType, action_type, fields_of, service_type, to_cdr
-from ibrobot_ros2.offers import TRIGGER, Offer, Offers, refused, time_of
+from ibrobot_ros2.offers import CHECK, Offer, Offers, refused, time_of
 from ibrobot_ros2.workers import StopWay
 
 from ibrobot_core.api import NS_PER_S, HardwareError, IbrobotError, NotSupported, did_you_mean
-from ibrobot_core.app import CHECK_ESTOP, CONTROL, ESTOP, GoalRun, SessionWorker, TransportLink
+from ibrobot_core.app import CONTROL, GoalRun, SessionWorker, TransportLink
 from ibrobot_zenoh.arrivals import Arrivals
 from ibrobot_zenoh.network import Reply, RosHandler, transport_of
 from ibrobot_zenoh.options import Share
@@ -28,8 +28,6 @@ _ENDED_KEPT = 100
 """Number of ended goals whose results can still be asked for."""
 _LOOK_S = 0.5
 """How often to look for services that a mode has brought."""
-_CHECK = Offer(TRIGGER, CHECK_ESTOP.name, {})
-"""Service that tries out an emergency stop."""
 _CANCELED, _REJECTED, _UNKNOWN, _OVER = 0, 1, 2, 3
 """Return codes of action_msgs/srv/CancelGoal."""
 
@@ -128,7 +126,7 @@ class RosSharing(SessionWorker):
         for name, offer in self._offers.found().items():
             if name not in self._served:
                 self._served.add(name)
-                check = partial(self._answer, _CHECK) if offer.service == ESTOP.name else None
+                check = partial(self._answer, CHECK) if offer.service == "/estop" else None
                 way = self._way if offer.urgent else None
                 self._serve(name, service_type(offer.type), partial(self._answer, offer), way, check)
 

@@ -20,11 +20,12 @@ from ibrobot_ros2.services import (
 from ibrobot_ros2.workers import StopWay
 
 from ibrobot_core.api import IbrobotError, NotSupported, Payload, TransportError, did_you_mean
-from ibrobot_core.app import CHECK_ESTOP, ESTOP, Component, RunView, TransportLink, described, type_name
+from ibrobot_core.app import Component, RunView, TransportLink, described, type_name
 from ibrobot_zenoh.arrivals import Arrivals
 from ibrobot_zenoh.network import transport_of
 from ibrobot_zenoh.options import Share
 
+_STOP, _CHECK = "/estop", "/estop/check"
 _MOST_BYTES = 1 << 20
 """Largest request to a service [bytes]."""
 _URGENT_BYTES = 1000
@@ -50,7 +51,7 @@ class SharedServices(Component):
         self._ends = ExitStack()
 
     def _offers(self, name: str) -> bool:
-        return self._share.offers(ESTOP.name if name == CHECK_ESTOP.name else name)
+        return self._share.offers(_STOP if name == _CHECK else name)
 
     @override
     def start(self) -> None:
@@ -60,8 +61,8 @@ class SharedServices(Component):
         self._ends.callback(served.end)
         self._way.open()
         self._ends.callback(self._way.close)
-        if self._offers(ESTOP.name):
-            answer = decode_answer(served.ask(encode_call(Call(CHECK_ESTOP.name)), _CHECK_S))
+        if self._offers(_STOP):
+            answer = decode_answer(served.ask(encode_call(Call(_CHECK)), _CHECK_S))
             if not answer.result:
                 raise TransportError(f"an emergency stop by {name} would fail: {answer.values}")
 
@@ -98,7 +99,7 @@ class SharedServices(Component):
         except IbrobotError as error:
             return encode_answer(Answer(str(error), result=False))
         except Exception as error:
-            if call is None or call.service == ESTOP.name:
+            if call is None or call.service == _STOP:
                 self._way.lose(error)
             self._session.log.exception("a service failed")
             return encode_answer(Answer("the service failed; the robot's log has the cause", result=False))

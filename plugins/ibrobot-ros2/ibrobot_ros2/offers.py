@@ -10,10 +10,11 @@ from typing import Any
 import attrs
 
 from ibrobot_core.api import NS_PER_S, IbrobotError
-from ibrobot_core.app import SET_MODE, RunView, Service
+from ibrobot_core.app import RunView, Service
 from ibrobot_ros2.services import plain
 
 TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
+_SET_MODE = "/set_mode"
 _NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 
 
@@ -28,6 +29,10 @@ class Offer:
     field: str = ""
     """Field of the request filled from `SetBool.data`; empty without one."""
     urgent: bool = False
+
+
+CHECK = Offer(TRIGGER, "/estop/check", {})
+"""Service that tries out an emergency stop."""
 
 
 def ros_type(service: Service[Any, Any]) -> tuple[str, str] | None:
@@ -63,7 +68,7 @@ class Offers:
         for name, service in self._session.bus.services().items():
             if not self._is_chosen(name):
                 continue
-            if name == SET_MODE.name:
+            if name == _SET_MODE:
                 for mode in self._session.config.control_modes:
                     offers[f"{name}/{mode}"] = Offer(TRIGGER, name, {"mode": mode})
             elif (kind := ros_type(service)) is not None:

@@ -22,7 +22,7 @@ from ibrobot_core.api import (
     JointTrajectoryPoint,
     ns,
 )
-from ibrobot_core.app import SET_MODE, Agent, Session
+from ibrobot_core.app import Agent, Session
 
 GOAL = {"goal": "pan=0.4"}
 KEYS = "Y lets it move   N refuses   T time   V speed"
@@ -46,7 +46,7 @@ class Rig:
         self.planned: list[Any] = []
         self.took_s = 0.0
         bus = self.session.bus
-        bus.serve(stand_in(SET_MODE.name), lambda request: None)
+        bus.serve(stand_in("/set_mode"), lambda request: None)
         for name in ("/planning/go_to", "/move_action", "/task/step", "/test/dance", "/test/other"):
             bus.serve(stand_in(name), lambda request: 1)
         for name in ("/planning/plan", "/plan_kinematic_path", "/compute_cartesian_path"):

@@ -12,7 +12,7 @@ import pytest
 from ibrobot_terminal import run_terminal
 from ibrobot_terminal.run_terminal import Panel
 
-from ibrobot_core.app import ESTOP, Authority, RunHooks
+from ibrobot_core.app import Authority, RunHooks
 
 if TYPE_CHECKING:
     from fake_runs import Runs
@@ -126,6 +126,6 @@ class TestStops:
     def test_keys_pressed_before_one_of_another_person_do_nothing_after_it(self, run: Runtime, panel: Panel) -> None:
         run.session.emergency_stop()
         panel.press("f10", run.session.stops)
-        run.session.bus.call(ESTOP, None)
+        run.session.bus.call("/estop")
         panel.handle_keys()
         assert self.stopped(run)
