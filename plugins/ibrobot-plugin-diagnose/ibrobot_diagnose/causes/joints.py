@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from typing import override
 
 import numpy as np
@@ -20,7 +21,9 @@ _REPEATS = 0.6
 """Usual distance up to which pictures of a camera repeat, so that they say something of the pose."""
 _CONSEQUENCES = frozenset({
     "unseen_start", "unseen_states", "other_speed", "statistics", "limits_low", "stands_still", "arm_not_following",
+    "saturated", "odd_length", "odd_path", "idle_start", "idle_end",
 })  # fmt: skip
+"""Causes that an arm seems to have if its readings are not what they are taken for."""
 
 
 def _known(window: Window) -> Floats:
@@ -133,19 +136,26 @@ class OtherUnits(CardCause):
         states, usual = _known(window), np.abs(card.state).max()
         largest = float(np.quantile(np.abs(states), 0.99))
         ratio = max(largest / usual, 0.33 * usual / max(largest, 1e-6))
-        plain = float(np.diag(_costs(states, card)).mean())
-        unit, rest = "no unit that is known", plain
-        for name, factor in (("degrees", np.pi / 180), ("radians, the data in degrees", 180 / np.pi)):
-            cost = float(np.diag(_costs(states * factor, card)).mean())
-            if cost < 0.3 * plain and cost < rest:
-                unit, rest = name, cost
-        if unit.startswith("no") and 20.0 < largest <= 101.0:
-            unit = "-100 to 100"
+        # Of most joints: a gripper may have a unit of its own.
+        costs = {unit: float(np.median(np.diag(_costs(each, card)))) for unit, each in self._in_units(window, states)}
+        best = min(costs, key=lambda unit: costs[unit])
+        plain = float(np.median(np.diag(_costs(states, card))))
+        unit = best if costs[best] < 0.3 * plain else "no unit that is known"
         text = (
             f"The joint positions reach {largest:.3g}, where those of the data reach {usual:.3g} rad: they are in "
             f"{unit}."
         )
         return Evidence(text, ratio, "times", 4.0, likelihood(ratio, 4.0, 8.0))
+
+    @staticmethod
+    def _in_units(window: Window, states: Floats) -> Iterator[tuple[str, Floats]]:
+        """The positions in radians if they are in a unit, and this unit."""
+        yield "degrees", states * np.pi / 180
+        yield "radians, the data in degrees", states * 180 / np.pi
+        lower = np.array([each.lower for each in window.limits])
+        upper = np.array([each.upper for each in window.limits])
+        if np.isfinite(lower).all() and np.isfinite(upper).all():
+            yield "-100 to 100", lower + (upper - lower) * (states + 100) / 200
 
 
 class OtherNormMode(CardCause):
@@ -172,7 +182,7 @@ class JointOrder(CardCause):
     name = "joint_order"
     title = "the joints are in the order of the data"
     needs = frozenset({"motion", "state", "card"})
-    explains = _CONSEQUENCES | {"joint_zero", "gripper_scaled", "gripper_reversed", "arm_not_following"}
+    explains = _CONSEQUENCES | {"joint_zero", "gripper_scaled", "gripper_reversed"}
     remedy = (
         "Compare the order of `joints` in the robot YAML with that of the data (`ibrobot datasets info`), and the "
         "motors' numbers with their joints: move one by hand, and see which number changes."
