@@ -72,6 +72,8 @@ def test_snapshot_refuses_what_it_cannot_write() -> None:
         CliRunner().invoke(camera, ["snapshot", "0", "-o", "a.gif"], catch_exceptions=False)
     with pytest.raises(SensorError, match="no file, URL or device"):
         CliRunner().invoke(camera, ["snapshot", "nothing"], catch_exceptions=False)
+    with pytest.raises(SensorError, match=r"^/dev/video77: there is no such device"):
+        CliRunner().invoke(camera, ["snapshot", "77"], catch_exceptions=False)
 
 
 def test_preview_shows_the_stream_to_who_has_the_token() -> None:

@@ -470,6 +470,18 @@ def test_a_joint_that_was_hardly_moved_is_refused(home, tmp_path, joint):
     assert not list(home.rglob("mine*"))
 
 
+def test_import_of_a_missing_file_says_where_lerobot_keeps_its_own(home):
+    with pytest.raises(
+        CalibrationError, match=r"theirs\.json: there is no such file; LeRobot keeps its calibrations in"
+    ):
+        CliRunner().invoke(feetech, ["import", "missing/theirs.json", "--name", "mine"], catch_exceptions=False)
+
+
+def test_check_without_a_calibration_prints_the_whole_command_that_makes_one(home):
+    with pytest.raises(CalibrationError, match="`ibrobot feetech calibrate /dev/ttyACM3 --name mine` makes one"):
+        CliRunner().invoke(feetech, ["check", "/dev/ttyACM3", "--name", "mine"], catch_exceptions=False)
+
+
 @pytest.mark.parametrize("joint", [each for each in JOINTS if each != "wrist_roll"])
 def test_a_range_that_does_not_fit_the_limits_is_shown(home, tmp_path, joint):
     path = tmp_path / "theirs.json"

@@ -85,7 +85,9 @@ class TestRun:
     def test_a_table_is_enough(self, make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         config, line = said(make, caplog, FLOOR, text=robot_yaml(tmp_path))
         assert config.control.guard is not None
-        assert line == "all commands keep 3 mm from the table at 0.04 m, 1 mm between links (control.guard: null: off)"
+        assert (
+            line == "all commands keep 3 mm from the table at 0.04 m, 1 mm between links (off by control.guard: null)"
+        )
         assert config.document["control"]["guard"] == {"type": "clearance"}, "recordings have it"
 
     def test_one_key_switches_it_off(self, make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -16,6 +16,7 @@ from ibrobot_camera.options import OpenCvOptions
 from ibrobot_core.api import CompressedImage, Context, Image, RealClock, Robot, SensorError
 from ibrobot_core.app import find_config, installed_plugins, load_config, wrong_input
 
+_UNNAMED = "camera"
 _QUALITY = 80
 _TO_BGR = {"bgr8": None, "rgb8": cv2.COLOR_RGB2BGR, "mono8": cv2.COLOR_GRAY2BGR}
 
@@ -35,16 +36,24 @@ def opened(source: str) -> Iterator[dict[str, OpenCvCamera]]:
             ctx = Context(name, clock, logging.getLogger(f"ibrobot.{name}"), Robot("camera", ()))
             camera = OpenCvCamera(options, ctx)
             with wrong_input():
-                camera.open()
+                _open(camera)
             stack.callback(camera.close)
             cameras[name] = camera
         yield cameras
 
 
+def _open(camera: OpenCvCamera) -> None:
+    try:
+        camera.open()
+    except SensorError as error:
+        # A device that is given by itself has no name to tell; its message begins with the device.
+        raise SensorError(str(error).removeprefix(f"camera {_UNNAMED}: ")) from None
+
+
 def _options(source: str) -> dict[str, OpenCvOptions]:
     registry = installed_plugins()
     if not source.endswith((".yaml", ".yml")):
-        return {"camera": OpenCvOptions(device=source, strict=False)}
+        return {_UNNAMED: OpenCvOptions(device=source, strict=False)}
     config = load_config(find_config(source, registry), registry=registry)
     by_name = {name: p.options for name, p in config.peripherals.items() if isinstance(p.options, OpenCvOptions)}
     if not by_name:

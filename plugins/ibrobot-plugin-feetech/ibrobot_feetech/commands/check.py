@@ -70,7 +70,7 @@ def check_arm(
         HardwareError: if a servo answers wrongly, or the port is gone.
     """
     joints = joints_of(robot, name)
-    calibration = load_calibration(name, [joint.name for joint in joints], tool=TOOL)
+    calibration = load_calibration(name, [joint.name for joint in joints], tool=TOOL, device=port or "")
     guide.say(
         f"{calibration.path}: arm {calibration.robot or 'unnamed'}, made {calibration.date or 'at an unknown time'}"
     )

@@ -17,6 +17,8 @@ from ibrobot_feetech.commands.ranges import Range, doubtful, impossible
 from ibrobot_feetech.commands.zero import zero_text
 from ibrobot_feetech.usb import usb_port
 
+_LEROBOTS = "LeRobot keeps its calibrations in ~/.cache/huggingface/lerobot/calibration"
+
 
 @attrs.frozen(kw_only=True)
 class ImportCalibration:
@@ -75,6 +77,8 @@ def _load(file: str, wanted: Sequence[Joint], prefix: str, zero_at: str | None) 
     try:
         imported = load_calibration(file, names, zero_at=zero_at)
     except CalibrationError as error:
+        if isinstance(error.__context__, FileNotFoundError):
+            raise CalibrationError(f"{calibration_path(file)}: there is no such file; {_LEROBOTS}") from None
         try:
             imported, names = load_calibration(file, plain, zero_at=zero_at), plain
         except CalibrationError:

@@ -69,12 +69,12 @@ def notice(config: RobotConfig) -> str:
         options = guard.options
         if options.base is not None:
             around = "the section world" if "world" in config.plugin_sections else "nothing, without a section world"
-            return f"the base keeps {1e3 * options.base.margin:g} mm from {around} (control.guard: null: off)"
+            return f"the base keeps {1e3 * options.base.margin:g} mm from {around} (off by control.guard: null)"
         floor = config.robot.description.floor if options.floor is None else options.floor
         things = [] if floor is None else [f"the table at {floor:g} m"]
         things += ["the section world"] if "world" in config.plugin_sections else []
         around = f"{1e3 * options.margin:g} mm from {' and '.join(things)}, " if things else ""
-        return f"all commands keep {around}{1e3 * options.self_margin:g} mm between links (control.guard: null: off)"
+        return f"all commands keep {around}{1e3 * options.self_margin:g} mm between links (off by control.guard: null)"
     why = "control.guard is null"
     if "guard" not in (config.document.get("control") or {}):
         why = "set robot.description.floor to the height of the table"
