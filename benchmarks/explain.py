@@ -3,10 +3,10 @@
     python benchmarks/explain.py [--work explain] [--healthy 100] [--trials 1] [--tune] [--only CAUSE ...]
 
 1. Demonstrations of the pick in lockstep, with two small cameras, and policies trained on them: an ACT on the joints
-   and the cube's pose, three that were stopped early, one on the pictures, and a small Diffusion policy; each has its
-   card beside it.
+   and the cube's pose, three that were stopped early, one on the pictures, three like it that see nothing in those of a
+   camera, and a small Diffusion policy; each has its card beside it.
 2. Each fault of `explain_faults.py` in three strengths, `--trials` seeds each: a run of at most 6 s, recorded, and
-   explained with the card of the policy's training. The first line must name the fault.
+   explained with the card of the policy's training. The first line must name the fault. Some also with Diffusion.
 3. Healthy runs of all policies, successes and failures: nothing may be named.
 
 Demonstrations, trials, and the trials of `--tune`, on which thresholds may be chosen, have seeds of their own. The
@@ -32,8 +32,10 @@ from typing import Any
 from unittest.mock import patch
 
 import attrs
-from explain_faults import EARLY, FAULTS, Fault
+import numpy as np
+from explain_faults import BLIND, DIFFUSED, EARLY, FAULTS, Fault
 from figures import report
+from safetensors.numpy import load_file, save_file
 
 CONFIG = Path(__file__).parents[1] / "configs" / "so101_pick_cube.yaml"
 DEMOS, TUNED, REPORTED = 1000, 3000, 5000
@@ -41,7 +43,8 @@ DEMOS, TUNED, REPORTED = 1000, 3000, 5000
 STRENGTHS = ("mild", "medium", "strong")
 SECONDS = 6
 PROMPT = "put the cube into the bin"
-POLICIES = ("state", *(f"early-{steps}" for steps in EARLY), "pictures", "diffusion", "scripted")
+EARLY_ONES, BLIND_ONES = tuple(f"early-{steps}" for steps in EARLY), tuple(f"blind-{times}" for times in BLIND)
+POLICIES = ("state", *EARLY_ONES, "pictures", *BLIND_ONES, "diffusion", "scripted")
 HEALTHY = ("state", f"early-{EARLY[0]}", "pictures", "diffusion", "scripted")
 """Policies of the runs without a fault: some succeed, some fail."""
 _CAMERAS = "".join(
@@ -103,8 +106,22 @@ def prepare(work: Path, episodes: int, policies: Sequence[str]) -> None:
     ):
         if name in policies and not (work / name / "checkpoints/last").exists():
             command("train", dataset, "--out", work / name, "--device", "cpu", *words)
+    for times, name in zip(BLIND, BLIND_ONES, strict=True):
+        if name in policies and "pictures" in policies and not (work / name).exists():
+            blind(work / "pictures/checkpoints/last/pretrained_model", work / name, times)
     if not (work / "reference.json").exists():
         command("datasets", "card", demos, "--out", work / "reference.json")
+
+
+def blind(checkpoint: Path, out: Path, times: int) -> None:
+    """A copy of a policy to which all pictures of `top` look grey."""
+    part = out.with_suffix(".part")
+    shutil.rmtree(part, ignore_errors=True)
+    copy = shutil.copytree(checkpoint, part / "checkpoints/last/pretrained_model")
+    (file,) = copy.glob("policy_preprocessor*.safetensors")
+    numbers, name = load_file(file), "observation.images.top.std"
+    save_file({**numbers, name: numbers[name] * np.float32(times)}, file)
+    part.rename(out)
 
 
 @attrs.frozen
@@ -117,6 +134,12 @@ class Trial:
     policy: str
     argument: Any
     seed: int
+
+    @property
+    def row(self) -> str:
+        """Its row in the table."""
+        usual = self.fault is None or self.policy != "diffusion"
+        return self.cause if usual else f"{self.cause} ({self.policy})"
 
     @property
     def fault(self) -> Fault | None:
@@ -143,7 +166,8 @@ def act(work: Path, trial: Trial) -> None:
     words = list(fault.options(trial.argument)) if fault is not None else []
     config = root / "cube.yaml"
     velocity = words[1] if words[:1] == ["velocity"] else "3.0"
-    config.write_text(robot(velocity, sees=policy in ("pictures", "scripted")), encoding="utf-8")
+    sees = policy in ("pictures", "scripted", *BLIND_ONES)
+    config.write_text(robot(velocity, sees=sees), encoding="utf-8")
     words = words[2:] if words[:1] == ["velocity"] else words
     if policy == "scripted":
         words += ["--mode", "scripted"]
@@ -168,6 +192,7 @@ def act(work: Path, trial: Trial) -> None:
 
 def explained(work: Path, trial: Trial) -> dict[str, Any]:
     """What is said of a recorded run."""
+    from ibrobot_diagnose.ask_again import examine, model_of
     from ibrobot_diagnose.cause import Reference
     from ibrobot_diagnose.diagnosis import diagnose
     from ibrobot_diagnose.references import card_of, read_episode
@@ -176,7 +201,8 @@ def explained(work: Path, trial: Trial) -> dict[str, Any]:
     (episode,) = trial.folder(work).glob("episodes/*/episodes/episode_*")
     window = read_episode(episode)
     trained = trial.fault is not None and trial.fault.trained
-    reference = Reference(card_of(work / trial.policy if trained else work / "reference.json"))
+    model = examine(model_of(window, episode, "")) if trial.fault is not None and trial.fault.asked else None
+    reference = Reference(card_of(work / trial.policy if trained else work / "reference.json"), model)
     explanation = Explanation.of(window, reference, diagnose(window, reference))
     findings = explanation.diagnosis.findings
     return {
@@ -203,10 +229,12 @@ def trials(arguments: argparse.Namespace) -> Iterator[Trial]:
     for number in range(3 * arguments.trials):
         place = (2, 0, 1)[number % 3]
         for row, (name, fault) in enumerate(FAULTS.items()):
-            policy = fault.policy or f"early-{fault.strengths[place]}"
-            chosen = STRENGTHS[place] in arguments.strengths and (not arguments.only or name in arguments.only)
-            if policy in arguments.policies and chosen:
-                yield Trial(name, STRENGTHS[place], policy, fault.strengths[place], first + 100 * number + row)
+            strength = fault.strengths[place]
+            if STRENGTHS[place] not in arguments.strengths or (arguments.only and name not in arguments.only):
+                continue
+            for policy in (fault.policy.format(strength), *(("diffusion",) if name in DIFFUSED else ())):
+                if policy in arguments.policies:
+                    yield Trial(name, STRENGTHS[place], policy, strength, first + 100 * number + row)
         policies = [each for each in HEALTHY if each in arguments.policies]
         for healthy in range(number, arguments.healthy, 3 * arguments.trials):
             policy = policies[healthy % len(policies)]
@@ -253,12 +281,12 @@ def show(results: Mapping[Trial, dict[str, Any]]) -> int:
     right, all_of = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
     for trial, each in results.items():
         if trial.cause:
-            all_of[trial.cause, trial.strength] += 1
-            right[trial.cause, trial.strength] += each.get("first") == trial.cause
-    print(f"{'cause':20}{''.join(f'{strength:>10}' for strength in STRENGTHS)}")
+            all_of[trial.row, trial.strength] += 1
+            right[trial.row, trial.strength] += each.get("first") == trial.cause
+    print(f"{'cause':32}{''.join(f'{strength:>10}' for strength in STRENGTHS)}")
     for name in dict.fromkeys(key[0] for key in all_of):
         cells = [f"{right[name, each]}/{all_of[name, each]}" for each in STRENGTHS]
-        print(f"{name:20}{''.join(f'{cell:>10}' for cell in cells)}")
+        print(f"{name:32}{''.join(f'{cell:>10}' for cell in cells)}")
     healthy = [each for trial, each in results.items() if not trial.cause]
     accused = [each for each in healthy if each.get("first") != ""]
     weak = [each for each in healthy if each.get("outcome") != "success"]

@@ -25,6 +25,13 @@ type Array = NDArray[Any]
 PAN, LIFT, ELBOW, GRIPPER = 0, 1, 2, 5
 EARLY = (240, 120, 40)
 """Steps after which trainings were stopped: 1.4, 0.7 and 0.2 times through the data."""
+BLIND = (100, 1000, 1_000_000)
+"""Times by which the statistics of a policy's pictures of `top` are too wide: all pictures look grey to it."""
+DIFFUSED = (
+    "observation_late", "answers_slow", "plan_dry", "requests_fail", "other_prompt", "joint_order", "gripper_reversed",
+    "other_units",
+)  # fmt: skip
+"""Faults that a Diffusion policy has, too."""
 REST = np.array([0, -1.57, 1.57, 0.79, 0, 0])
 
 
@@ -37,9 +44,11 @@ class Fault:
     strengths: tuple[Any, Any, Any]
     """Arguments of `plant`: mild, medium, strong."""
     policy: str = "state"
-    """The policy that acts: `state`, `pictures`, `diffusion` or `scripted`; empty for one that was stopped early."""
+    """The policy that acts: `state`, `pictures`, `diffusion` or `scripted`; with braces, one for each strength."""
     trained: bool = False
     """Whether the card of the training is at hand, and not only one of the data."""
+    asked: bool = False
+    """Whether the model is asked again."""
     options: Callable[[Any], tuple[str, ...]] = lambda strength: ()
     """Words of the command line."""
 
@@ -154,6 +163,13 @@ def zero(shift: float) -> None:
     off = np.zeros(6)
     off[PAN] = shift
     reported(lambda position: position + off, lambda position: position - off)
+
+
+def units(of: str) -> None:
+    """A driver that is written for another unit."""
+    widths = np.array([3.84, 3.49, 3.38, 3.32, 5.48, 1.92])
+    factor: Array = 200 / widths if of == "percent" else np.full(6, 180 / np.pi)
+    reported(lambda position: factor * position, lambda position: position / factor)
 
 
 def order(pair: tuple[int, int]) -> None:
@@ -311,7 +327,8 @@ FAULTS: Mapping[str, Fault] = {
     "gripper_reversed": Fault(gripper_reversed, (1, 1, 1)),
     "gripper_scaled": Fault(gripper_scaled, (1.8, 2.5, 3.5)),
     "joint_zero": Fault(zero, (0.2, 0.3, 0.45), "pictures"),
-    "checkpoint_early": Fault(nothing, EARLY, "", trained=True),
+    "other_units": Fault(units, ("percent", "degrees", "degrees")),
+    "checkpoint_early": Fault(nothing, EARLY, "early-{}", trained=True),
     "unseen_success": Fault(never_judged, (1, 1, 1), "scripted"),
     "picture_dark": Fault(scaled, ((0.65,), (0.5,), (0.25,)), "pictures"),
     "picture_bright": Fault(scaled, ((1.4,), (1.6,), (1.9,)), "pictures"),
@@ -323,5 +340,6 @@ FAULTS: Mapping[str, Fault] = {
     "picture_flipped": Fault(lambda strength: of_top(lambda pixels: pixels[::-1, ::-1]), (1, 1, 1), "pictures"),
     "cameras_exchanged": Fault(exchanged, (1, 1, 1), "pictures"),
     "camera_moved": Fault(moved, ((0.02, 0.0), (0.04, 0.05), (0.08, 0.15)), "pictures"),
+    "camera_ignored": Fault(nothing, BLIND, "blind-{}", asked=True),
 }  # fmt: skip
 """Cause -> the fault that it explains."""
