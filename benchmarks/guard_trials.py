@@ -134,6 +134,15 @@ class Judge:
         self.model = model = spec.compile()
         self.data = mujoco.MjData(model)
         self._columns = [int(model.joint(name).qposadr[0]) for name in robot.joint_names]
+        self._couplings = [
+            (
+                int(model.jnt_qposadr[model.eq_obj1id[i]]),
+                int(model.jnt_qposadr[model.eq_obj2id[i]]),
+                model.eq_data[i, :2],
+            )
+            for i in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT)
+        ]
+        """Joints that follow another one, e.g. the second finger of the FR3: their places, and offset and factor."""
         things = {"floor", *SIZES}
         self._names = [model.geom(i).name for i in range(model.ngeom)]
         self._names = [
@@ -176,6 +185,8 @@ class Judge:
         """Distances of the pairs that are near at `q`, shape (J,), those that they must keep [m], and their geoms."""
         data = self.data
         data.qpos[self._columns] = q
+        for follower, leader, (offset, factor) in self._couplings:
+            data.qpos[follower] = offset + factor * data.qpos[leader]
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_collision(self.model, data)
         pairs, away = data.contact.geom, np.array(data.contact.dist)

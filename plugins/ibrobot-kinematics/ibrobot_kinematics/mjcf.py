@@ -26,6 +26,8 @@ from ibrobot_kinematics.rotations import from_quaternion
 
 _SLIDE, _HINGE = 2, 3
 """Values of mujoco.mjtJoint."""
+_COUPLED = 2
+"""Value of mujoco.mjtEq for joints."""
 _LINE = re.compile(r"\bline (?:number=)?([1-9]\d*)", re.IGNORECASE)
 
 
@@ -44,6 +46,16 @@ class TreeJoint:
     """Position at which the joint causes no displacement [rad or m]."""
     slides: bool
     """Whether it is prismatic; revolute otherwise."""
+
+
+@attrs.frozen
+class Follower:
+    """How a joint follows another one, e.g. the second finger of a gripper: by displacements from the references."""
+
+    leader: str
+    factor: float
+    offset: float
+    """[rad or m]."""
 
 
 @attrs.frozen(eq=False)
@@ -91,7 +103,7 @@ class Mjcf:
         return tuple(body.name for body in _only_visible(self.spec))
 
     def tree(self, model: Any, joints: Iterable[str]) -> JointTree:
-        """The tree of some joints in `skeleton` or `solid`. Others stay at their reference position.
+        """The tree of some joints in `skeleton` or `solid`. Others, and `followers`, stay at their reference position.
 
         Raises:
             KinematicsError: if the file lacks a joint, or one is neither a hinge nor a slide.
@@ -122,6 +134,26 @@ class Mjcf:
                 carrier, placed = len(placed_joints) - 1, np.linalg.inv(anchor)
             bodies.append((carrier, placed))
         return JointTree(tuple(placed_joints), tuple(bodies))
+
+    def followers(self, model: Any, joints: Iterable[str]) -> Mapping[str, Follower]:
+        """Other joints that follow some joints in `skeleton` or `solid`, as joints of a URDF that mimic them do.
+
+        Joints that follow in another way, e.g. by tendons, loops, or a curve, are not among them.
+        """
+        coupled: dict[str, Follower] = {}
+        for row in np.flatnonzero((model.eq_type == _COUPLED) & (model.eq_active0 != 0)).tolist():
+            second, curve = int(model.eq_obj2id[row]), model.eq_data[row, :5]
+            if second >= 0 and not curve[2:].any():
+                name, leader = (model.joint(joint).name for joint in (int(model.eq_obj1id[row]), second))
+                coupled[name] = Follower(leader, float(curve[1]), float(curve[0]))
+        leaders = {name: Follower(name, 1.0, 0.0) for name in joints}
+        found: dict[str, Follower] = {}
+        while new := {n: each for n, each in coupled.items() if each.leader in leaders and n not in leaders}:
+            for name, each in new.items():
+                of = leaders[each.leader]
+                found[name] = Follower(of.leader, each.factor * of.factor, each.offset + each.factor * of.offset)
+            leaders |= found
+        return found
 
     def chain(
         self, tip: str, joints: Sequence[str], *, lower: Vector | None = None, upper: Vector | None = None

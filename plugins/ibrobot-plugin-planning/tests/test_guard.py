@@ -380,7 +380,12 @@ def test_cells_in_several_regions_may_be_touched_by_the_links_of_each(tmp_path) 
     regions = {"inner": RegionOptions(*inner, ("hand",)), "outer": RegionOptions(*outer, ("wrist",))}
     loop = Loop(tmp_path, regions=regions)
     known = loop.guard._permissions.applied(World({"cloud": WorldObject(Voxels(0.01, CELLS))})).objects
-    assert {name: (thing.may_touch, thing.shape.cells.tolist()) for name, thing in known.items()} == {
+    divided = {
+        name: (thing.may_touch, thing.shape.cells.tolist())
+        for name, thing in known.items()
+        if isinstance(thing.shape, Voxels)
+    }
+    assert divided == {
         "cloud": (frozenset(), [[30, 0, 5]]),
         "cloud in outer": (frozenset({"wrist"}), [[18, 0, 5]]),
         "cloud in inner and outer": (frozenset({"hand", "wrist"}), [[15, 0, 5]]),

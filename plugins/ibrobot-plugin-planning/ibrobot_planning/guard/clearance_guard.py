@@ -67,6 +67,9 @@ class ClearanceGuard(Guard):
         if self._arm.only_visible:
             links = ", ".join(self._arm.only_visible)
             context.log.info("the guard takes hulls of visible meshes for links without collision geometry: %s", links)
+        if self._arm.unmoved:
+            message = "the guard takes joints that the robot does not have to stay at their reference position: %s"
+            context.log.warning(message, ", ".join(self._arm.unmoved))
         period_s = seconds(context.period_ns)
         self._period_s = period_s
         self._change: Vector = robot.max_acceleration[columns] * period_s**2

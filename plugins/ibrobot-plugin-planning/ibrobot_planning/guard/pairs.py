@@ -64,6 +64,8 @@ class Pairs:
             self.parts.append(part)
             pause()
         self._data = arm.model.createData()
+        self._turning = np.abs(arm.effects).sum(axis=0)
+        """How far all that turns with each joint turns together, at most [rad/rad], shape (J,)."""
         self.names: Sequence[Pair] = [names for part in self.parts for names in part.names]
         sizes = [len(part.names) for part in self.parts]
         begins = np.cumsum([0, *sizes])
@@ -332,7 +334,7 @@ class Pairs:
         across = (turning**2).sum(axis=2) - np.einsum("kscj,kc->ksj", turning, normals) ** 2
         turn = np.sqrt(np.maximum(across, 0.0)).sum(axis=2)
         swung = turn[:, 0] * self._radii[pairs, 0] + turn[:, 1] * self._radii[pairs, 1]
-        curved = np.abs(half).sum() * (self.levers[pairs] @ np.abs(half)) / 2
+        curved = (self._turning @ np.abs(half)) * (self.levers[pairs] @ np.abs(half)) / 2
         approach: Vector = np.where(self._convex[pairs], np.abs(along) + swung + curved, np.inf)
         return approach
 
@@ -353,7 +355,7 @@ class Pairs:
         """
         arm = self.moving.arm
         pinocchio.computeJointJacobians(arm.model, self._data)
-        jacobian = self._data.J[:, arm.columns]
+        jacobian = self._data.J
         normals, points = np.empty((len(pairs), 3)), np.empty((len(pairs), 2, 3))
         for row, (part, number) in enumerate(
             zip((self.parts[of] for of in self._of[pairs].tolist()), self._number[pairs].tolist(), strict=True)
@@ -370,7 +372,7 @@ class Pairs:
         arms = np.stack([_cross(points[:, 0], normals), _cross(points[:, 1], normals)], axis=1)
         moving = (normals @ jacobian[:3])[:, None] * self._moves[pairs] + np.einsum("ksc,kscj->ksj", arms, turns)
         rates = moving[:, 1] - moving[:, 0]
-        return normals, rates, turns
+        return normals, rates @ arm.effects, turns @ arm.effects
 
 
 def _cross(a: Vector, b: Vector) -> Vector:

@@ -46,7 +46,7 @@ class Moving:
     still: Sequence[LinkShape]
     """The others, e.g. of the base."""
     levers: Vector
-    """As of `_levers`, shape (S, J)."""
+    """As of `_levers`, shape (S, N)."""
     coarse: Moving | None = None
     """With one hull in place of the shapes of each link, for clouds, whose many blocks are coarse themselves."""
 
@@ -102,13 +102,13 @@ class Part:
         self.ends = np.stack([first, second], axis=1)
         """The shapes of each pair, shape (P, 2)."""
         self.names: Sequence[Pair] = [(shapes[a].link, shapes[b].link) for a, b in self.ends.tolist()]
-        levers = np.zeros((len(shapes), len(arm.joint_names)))
+        levers = np.zeros((len(shapes), arm.model.nq))
         levers[:count] = moving.levers
         a, b = levers[first], levers[second]
         both = (a > 0) & (b > 0)  # a joint that moves both does not change their distance
         self.moves: Vector = np.stack([np.where(both, 0.0, a > 0), np.where(both, 0.0, b > 0)], axis=1)
-        """Whether each joint moves the first and the second shape of each pair, not the other, shape (P, 2, J)."""
-        self.levers: Vector = np.where(both, 0.0, a + b)
+        """Whether each of Pinocchio's joints moves the first and the second shape of a pair, not both: (P, 2, N)."""
+        self.levers: Vector = np.where(both, 0.0, a + b) @ np.abs(arm.effects)
         """Largest motion of each pair per joint [m/rad], shape (P, J)."""
         bounded = [_has_sphere(shape) for shape in shapes]
         self.centres: Sequence[Vector] = [
@@ -240,20 +240,18 @@ def _has_sphere(shape: LinkShape) -> bool:
 def _levers(arm: Arm, shapes: Sequence[LinkShape]) -> Vector:
     """Largest distance of any point of each shape from each joint's axis [m]; 1 for slides, 0 if it moves it not.
 
-    Shape (S, J). Upper bounds for all configurations, from bounding spheres on a stretched-out arm.
+    Of Pinocchio's joints, shape (S, N). Upper bounds for all configurations, from bounding spheres on a stretched-out
+    arm.
     """
     model = arm.model
-    columns = {int(number): column for column, number in enumerate(arm.numbers)}
-    travel = np.where(arm.slides, np.maximum(np.abs(arm.lower), np.abs(arm.upper)), 0.0)
-    levers = np.zeros((len(shapes), len(arm.joint_names)))
+    levers = np.zeros((len(shapes), model.nq))
     for row, shape in zip(levers, shapes, strict=True):
         joint = shape.joint
         shape.geometry.computeLocalAABB()
         centre = shape.placement[:3, :3] @ shape.geometry.aabb_center + shape.placement[:3, 3]
         away = float(np.linalg.norm(centre) + shape.geometry.aabb_radius)
         while joint:
-            column = columns[joint]
-            row[column] = 1.0 if arm.slides[column] else away
-            away += travel[column] + float(np.linalg.norm(model.jointPlacements[joint].translation))
+            row[joint - 1] = 1.0 if arm.slide[joint - 1] else away
+            away += arm.travel[joint - 1] + float(np.linalg.norm(model.jointPlacements[joint].translation))
             joint = int(model.parents[joint])
     return levers

@@ -6,7 +6,7 @@ Pinocchio places the links, Coal finds contacts (ADR 31).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,25 @@ class LinkShape:
     """The tree of bodies to which the link belongs, e.g. one of two arms: MuJoCo's number of its root; 0: the world."""
 
 
+def _indices() -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    return np.zeros(0, dtype=np.intp)
+
+
 @attrs.frozen(eq=False)
+class Followers:
+    """Joints of the model that follow the robot's, e.g. the second finger of a gripper; F is their number."""
+
+    columns: np.ndarray[tuple[int], np.dtype[np.intp]] = attrs.field(factory=_indices)
+    """Index of each in Pinocchio's vector, shape (F,)."""
+    leaders: np.ndarray[tuple[int], np.dtype[np.intp]] = attrs.field(factory=_indices)
+    """Index of the joint that it follows among the robot's, shape (F,)."""
+    factors: Vector = attrs.field(factory=lambda: np.zeros(0))
+    """Shape (F,)."""
+    offsets: Vector = attrs.field(factory=lambda: np.zeros(0))
+    """[rad or m], shape (F,)."""
+
+
+@attrs.frozen(eq=False, slots=False)
 class Arm:
     """Joints, links and shapes. Vectors of joint positions have the order of `joint_names`."""
 
@@ -74,12 +92,45 @@ class Arm:
     """Link of the URDF -> link of the MJCF; empty without a URDF."""
     only_visible: tuple[str, ...] = ()
     """Links without collision geometry, of which the visible meshes' hulls count."""
+    followers: Followers = Followers()
+    unmoved: tuple[str, ...] = ()
+    """Joints of the MJCF that neither are the robot's nor follow one of them: they stay at their reference."""
 
     def native(self, q: Vector) -> Vector:
-        """Joint positions, shape (..., J), in Pinocchio's order and zero."""
-        converted = np.empty(q.shape)
+        """Joint positions, shape (..., J), in Pinocchio's order and zero, shape (..., N)."""
+        converted = np.empty((*q.shape[:-1], self.model.nq))
         converted[..., self.columns] = q - self.reference
-        return converted
+        return self.followed(converted)
+
+    def followed(self, native: Vector, *, motion: bool = False) -> Vector:
+        """The same array, shape (..., N), with where the followers are; with their motion by that of the others."""
+        each = self.followers
+        if len(each.columns):
+            followed = each.factors * native[..., self.columns[each.leaders]]
+            native[..., each.columns] = followed if motion else followed + each.offsets
+        return native
+
+    @cached_property
+    def effects(self) -> Vector:
+        """How far Pinocchio's joints move with each of the robot's, shape (N, J)."""
+        effects = np.zeros((self.model.nq, len(self.joint_names)))
+        effects[self.columns, np.arange(len(self.joint_names))] = 1.0
+        effects[self.followers.columns, self.followers.leaders] = self.followers.factors
+        return effects
+
+    @cached_property
+    def slide(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        """Which of Pinocchio's joints are prismatic, shape (N,)."""
+        kinds = [joint.shortname() for joint in list(self.model.joints)[1:]]
+        return np.array([kind == "JointModelPrismaticUnaligned" for kind in kinds], dtype=bool)
+
+    @cached_property
+    def travel(self) -> Vector:
+        """Maximum displacement of each of Pinocchio's joints if it is prismatic, else 0 [m], shape (N,)."""
+        own = np.maximum(np.abs(self.lower - self.reference), np.abs(self.upper - self.reference))
+        farthest = np.abs(self.effects) @ own
+        farthest[self.followers.columns] += np.abs(self.followers.offsets)
+        return np.where(self.slide, farthest, 0.0)
 
     def link_pose(self, link: str, q: Vector) -> Vector:
         """Pose of a link in the base frame, shape (4, 4).
@@ -131,14 +182,16 @@ class Arm:
         return [(i, j) for (i, a), (j, b) in combinations(enumerate(self.shapes), 2) if a.joint != b.joint]
 
     def adjacent(self) -> set[Pair]:
-        """Links that one joint connects."""
-        connected = set()
+        """Links that one joint connects, or moves beside one another, as the two fingers of a gripper."""
+        connected, parents = set(), self.model.parents
+        moving = [(), *(tuple(np.flatnonzero(row)) for row in self.effects)]
         for i, j in self.pairs():
             a, b = self.shapes[i], self.shapes[j]
             # All that stands has the joint 0, so there the base of another arm would count as connected, too.
             if a.tree != b.tree and a.tree and b.tree:
                 continue
-            if self.model.parents[a.joint] == b.joint or self.model.parents[b.joint] == a.joint:
+            beside = parents[a.joint] == parents[b.joint] and moving[a.joint] == moving[b.joint]
+            if parents[a.joint] == b.joint or parents[b.joint] == a.joint or beside:
                 connected.add(sorted_pair(a.link, b.link))
         return connected
 
@@ -171,7 +224,7 @@ def read_arm(path: Path, joints: tuple[str, ...], arms: tuple[tuple[str, tuple[f
 
     Args:
         path: the MJCF.
-        joints: the joints that may move, in the order of vectors. Others stay at their reference position.
+        joints: the joints that may move, in the order of vectors. Others follow them, or stay at their reference.
         arms: of several equal arms, prefix of its names and place of its base, as in `robot.description.arms`.
 
     Raises:
@@ -182,7 +235,8 @@ def read_arm(path: Path, joints: tuple[str, ...], arms: tuple[tuple[str, tuple[f
     try:
         mjcf = Mjcf(path, several_arms(path, dict(arms))) if arms else read_mjcf(path)
         source = mjcf.solid
-        tree = mjcf.tree(source, joints)
+        follow = mjcf.followers(source, joints)
+        tree = mjcf.tree(source, (*joints, *follow))
     except KinematicsError as error:
         raise _unusable(str(error)) from error
     model = pinocchio.Model()
@@ -196,6 +250,7 @@ def read_arm(path: Path, joints: tuple[str, ...], arms: tuple[tuple[str, tuple[f
     if not shapes:
         raise _unusable(f"{path} has no geometry that could collide")
     limits = source.jnt_range[[source.joint(name).id for name in joints]]
+    movable = (source.joint(number).name for number in range(source.njnt))
     return Arm(
         joint_names=joints,
         model=model,
@@ -208,6 +263,13 @@ def read_arm(path: Path, joints: tuple[str, ...], arms: tuple[tuple[str, tuple[f
         numbers=np.array(numbers, dtype=np.intp),
         slides=np.array([joint.slides for joint in moving], dtype=bool),
         only_visible=mjcf.only_visible,
+        followers=Followers(
+            np.array([model.joints[model.getJointId(name)].idx_q for name in follow], dtype=np.intp),
+            np.array([joints.index(each.leader) for each in follow.values()], dtype=np.intp),
+            np.array([each.factor for each in follow.values()]),
+            np.array([each.offset for each in follow.values()]),
+        ),
+        unmoved=tuple(name for name in movable if name not in joints and name not in follow),
     )
 
 
@@ -263,16 +325,18 @@ def _hull(source: Any, mesh: int) -> tuple[Vector, np.ndarray[tuple[int, ...], n
 def reach(arm: Arm, carried: Sequence[LinkShape]) -> Vector:
     """Maximum distance of any point of the arm, and of what it carries, from each joint's axis [m], shape (J,).
 
-    An upper bound, from bounding spheres of the shapes on a stretched-out arm; 1 for slide joints.
+    An upper bound, from bounding spheres of the shapes on a stretched-out arm; 1 for slide joints. With the motion of
+    joints that follow.
     """
     model, farthest = arm.model, _farthest(arm).copy()
     for shape in carried:
         if shape.joint:
             farthest[shape.joint] = max(farthest[shape.joint], _away(shape))
+    travel = np.concatenate([[0.0], arm.travel])
     for joint in range(model.njoints - 1, 0, -1):
         parent, away = model.parents[joint], np.linalg.norm(model.jointPlacements[joint].translation)
-        farthest[parent] = max(farthest[parent], away + farthest[joint])
-    return np.where(arm.slides, 1.0, farthest[arm.numbers])
+        farthest[parent] = max(farthest[parent], away + travel[joint] + farthest[joint])
+    return np.asarray(np.where(arm.slide, 1.0, farthest[1:]) @ np.abs(arm.effects))
 
 
 @lru_cache(maxsize=8)

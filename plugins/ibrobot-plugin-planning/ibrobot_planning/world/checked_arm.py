@@ -77,7 +77,6 @@ def may_touch_arm(robot: Robot, log: logging.Logger) -> Arm:
 def urdf_names(arm: Arm, urdf: Urdf) -> dict[str, str]:
     """Link of the MJCF -> link of the URDF that the same joint carries; also the base."""
     children = {joint.name: joint.child for joint in urdf.joints}
-    numbers = {int(number): name for number, name in zip(arm.numbers, arm.joint_names, strict=True)}
     names: dict[str, str] = {}
     named: set[int] = set()
     for link, (joint, _) in arm.frames.items():
@@ -87,8 +86,8 @@ def urdf_names(arm: Arm, urdf: Urdf) -> dict[str, str]:
         named.add(joint)
         if joint == 0:
             names[link] = urdf.root
-        elif numbers[joint] in children:
-            names[link] = children[numbers[joint]]
+        elif (name := arm.model.names[joint]) in children:
+            names[link] = children[name]
     return names
 
 

@@ -163,6 +163,7 @@ class Collisions:
         begin, way = self._still.copy(), np.zeros(len(self._still))
         begin[self._columns] = a - self._reference
         way[self._columns] = b - a
+        begin, way = self.arm.followed(begin), self.arm.followed(way, motion=True)
         travel = float(np.abs(b - a) @ self.reach)
         number = max(math.ceil(travel / resolution), 1)
         order, shares = spread(number)
@@ -208,7 +209,7 @@ class Collisions:
         whole = np.empty((len(configurations), len(self._still)))
         whole[:] = self._still
         whole[:, self._columns] = configurations - self._reference
-        return whole
+        return self.arm.followed(whole)
 
     def touches(self, native: Vector) -> bool:
         """Whether anything is closer than its padding at a configuration in Pinocchio's order."""
