@@ -18,8 +18,11 @@ import click
 from ibrobot_core.errors import RequestError
 from ibrobot_core.options import HIDDEN
 
-_UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2060-\u206f\ud800-\udfff]")
-"""Control characters except tab and line feed, those that change the text direction, and lone surrogates."""
+_CONTROL = "\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ud800-\udfff\U000e0000-\U000e0fff"
+_UNSEEN = "\xad\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\ufeff\uffa0\ufff0-\ufffb"
+_UNPRINTABLE = re.compile(f"[{_CONTROL}{_UNSEEN}]")
+"""Control characters except tab and line feed, those that change the text direction or show nothing, so that two names
+would look the same, and lone surrogates."""
 _CREDENTIALS = re.compile(r"(?P<scheme>\b[A-Za-z][A-Za-z0-9+.-]*://)[^\s/?#]*@")
 _PARAMETERS = re.compile(r"(?i)(?P<name>[?&](?:user(?:name)?|pass(?:word|wd)?|pwd|secret)=)[^&\s#'\"]+")
 _TYPED = "`uv run ibrobot " if "UV_RUN_RECURSION_DEPTH" in os.environ else "`ibrobot "
@@ -54,7 +57,7 @@ def printable(text: str) -> str:
     Unprintable characters are escaped as in JSON and YAML, e.g. `\u001b`, and secrets hidden.
     """
     text = redacted(text).replace("`ibrobot ", _TYPED)
-    return _UNPRINTABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
+    return _UNPRINTABLE.sub(lambda match: ("\\u%04x" if match[0] < "\U00010000" else "\\U%08x") % ord(match[0]), text)
 
 
 def echo(message: object = "", *, err: bool = False, nl: bool = True) -> None:
@@ -79,8 +82,7 @@ def prompt(question: str, *, flag: str) -> str:
     try:
         return input()
     except EOFError:
-        message = f"{question} Standard input has no answer: run it in a terminal, or give {flag}"
-        raise RequestError(message) from None
+        raise RequestError(f"{question} Standard input has no answer: run it in a terminal, or give {flag}") from None
 
 
 class LogFormatter(logging.Formatter):

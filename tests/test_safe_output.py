@@ -31,6 +31,8 @@ HOSTILE = st.lists(
     max_size=8,
 ).map("".join)
 UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u202a-\u202e\ud800-\udfff]")
+UNSEEN = "\u00ad\u034f\u115f\u200b\u200d\u2060\u2800\u3164\ufe0f\ufeff\uffa0\U000e0041"
+"""Some of the characters that terminals and pages show as nothing; several of them are letters to Unicode."""
 
 
 def rendered(*shown: object) -> str:
@@ -46,7 +48,17 @@ def test_nothing_unprintable_comes_through(hostile: str):
     assert not UNPRINTABLE.search(printable(hostile))
 
 
-@given(st.text(st.characters(exclude_categories=["C", "Zl", "Zp"]), max_size=50).filter(lambda each: "://" not in each))
+@pytest.mark.parametrize("unseen", UNSEEN)
+def test_names_that_look_the_same_are_not_shown_the_same(unseen: str):
+    shown = printable(f"cl{unseen}aude")
+    assert shown.isascii()
+    assert ast.literal_eval(f"'{shown}'") == f"cl{unseen}aude"
+
+
+@given(
+    st.text(st.characters(exclude_categories=["C", "M", "Zl", "Zp"], exclude_characters=UNSEEN + "\u1160"), max_size=50)
+    .filter(lambda each: "://" not in each)
+)  # fmt: skip
 def test_ordinary_text_stays_as_it_is(ordinary: str):
     assert printable(ordinary) == ordinary
 

@@ -59,9 +59,8 @@ class ActiveExecutors:
         Those are not the measured positions: a loaded arm would sink a little each time, and a gripper let go.
         """
         self._active = [self._all[name] for name in names]
-        self._streamed.clear()
         for owned in self._active:
-            owned.executor.activate(self._at_rest(owned, measured))
+            self._brake(owned, measured)
 
     def leave(self, measured: JointReading) -> None:
         """Deactivate all executors and cancel their goals."""
@@ -134,7 +133,7 @@ class ActiveExecutors:
         return {name: dict(owned.executor.counters()) for name, owned in self._all.items()}
 
     def _brake(self, owned: _Owned, measured: JointReading) -> Vector:
-        """Stop an executor that streams: its joints brake at once; returns where they come to rest [rad]."""
+        """Let the joints of an executor brake at once and hold; returns where they come to rest [rad]."""
         reading = self._at_rest(owned, measured)
         owned.executor.activate(reading)
         self._streamed.discard(owned.name)

@@ -100,7 +100,7 @@ class Executor(ABC):
 
     @abstractmethod
     def activate(self, measured: JointReading) -> None:
-        """Take over the joints, shape (J,) in the order of `joints`, and hold at `measured`: where the commands rest."""
+        """Take over the joints, shape (J,) as in `joints`, and hold at `measured`, where the commands rest."""
 
     @abstractmethod
     def update(self, measured: JointReading) -> Vector:

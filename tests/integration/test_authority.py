@@ -112,6 +112,29 @@ def test_recorded_episode_has_who_granted_what_before_it_began(tmp_path: Path) -
     assert recorded == [[("armed", "a person"), ("called", "")], [("ended", "")]]
 
 
+def test_recording_that_an_agent_has_begun_ends_with_its_authority_and_is_kept(tmp_path: Path) -> None:
+    run = AgentRun("empty", f"recording={{type: mcap, root: {tmp_path}, dataset: seen}}", request={"by_operator": True})
+    run.grant(seconds=1.0, services=("/record_episode/start",))
+    run.authority.call(run.agent, "/record_episode/start", "pan")
+    run.ticks(50)
+    assert run.session.episodes.running
+    run.ticks(60)
+    assert not run.session.episodes.running
+    run.close()
+    with closing(installed_plugins().open_episode(tmp_path / "seen/episodes/episode_000001")) as episode:
+        assert 0.9 < (episode.summary().end_ns - episode.summary().start_ns) / 1e9 < 1.1
+
+
+@pytest.mark.parametrize(
+    "stated", ["cl\u200baude", "\u3164claude", "cla\u202eude", "cl\u0430ude\U000e0041", "\x1bclaude", "a" * 5000]
+)
+def test_names_of_agents_are_short_and_read_the_same_by_everybody(run: AgentRun, stated: str) -> None:
+    name = run.authority.join(stated).name
+    assert name.isascii()
+    assert name.isprintable()
+    assert len(name) < 50
+
+
 @pytest.fixture
 def task_run() -> Iterator[AgentRun]:
     made = AgentRun("empty", "tasks={}")

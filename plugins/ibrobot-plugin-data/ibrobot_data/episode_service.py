@@ -109,7 +109,10 @@ class DatasetInfo:
     episodes: int = option(help="number of complete episodes in it")
 
 
-START = Service("/record_episode/start", StartEpisode, NoneType, "Begin an episode.", alone="prompt")
+CANCEL = Service(
+    "/record_episode/cancel", NoRequest, NoneType, "End the episode early, and keep it, as IB-Robot's recorder does."
+)
+START = Service("/record_episode/start", StartEpisode, NoneType, "Begin an episode.", alone="prompt", cancel=CANCEL)
 STOP = Service("/record_episode/stop", StopEpisode, NoneType, "End the episode.", alone="outcome")
 REDO = Service(
     "/record_episode/redo", NoRequest, NoneType,
@@ -121,9 +124,6 @@ STATUS = Service(
 )
 INFO = Service(
     "/record_episode/get_info", NoRequest, DatasetInfo, "Where episodes go, as IB-Robot's recorder says.", reads=True
-)
-CANCEL = Service(
-    "/record_episode/cancel", NoRequest, NoneType, "End the episode early, and keep it, as IB-Robot's recorder does."
 )
 PROGRESS = Service(
     "/record_episode/progress", NoRequest, RecordProgress, "How the present episode goes on.", reads=True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -257,6 +258,25 @@ def test_malformed_tasks_are_refused(check: Check, text: str, message: str):
         check(text)
     assert message in str(failure.value)
     assert failure.value.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    "hostile", ["a\x1b[2J", "a\nkeys  Y lets it move", "a\u202eb", "cube\u200b", "a\u2028b", "\ud800", "n" * 101]
+)
+@pytest.mark.parametrize(
+    "text", ["name: {}\nsteps:\n- wait: {{seconds: 0}}", "steps:\n- {{name: {}, wait: {{seconds: 0}}}}"]
+)
+def test_names_are_one_line_that_everybody_reads_the_same(check: Check, text: str, hostile: str):
+    with pytest.raises(ConfigError) as failure:
+        check(text.format(json.dumps(hostile)))
+    assert "name: a name is one line of at most 100 characters that show" in str(failure.value)
+
+
+def test_other_texts_have_several_lines_but_no_control_characters():
+    text = "steps:\n- record: {{prompt: {}}}"
+    read_task(text.format(json.dumps("pick\n\tthe cube")), "task.yaml")
+    with pytest.raises(ConfigError, match=r"steps.0.record.prompt: 'a\\x1b\[2J' has control characters"):
+        read_task(text.format(json.dumps("a\x1b[2J")), "task.yaml")
 
 
 def test_all_faults_are_reported_together(check: Check):

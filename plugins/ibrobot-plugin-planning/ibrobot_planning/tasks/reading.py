@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from unicodedata import category
 
 import attrs
 
@@ -16,6 +17,8 @@ from ibrobot_planning.tasks.format import Task
 
 EXAMPLES = Path(__file__).with_name("examples")
 _PARAMETER = re.compile(r"\$([A-Za-z_]\w*)")
+_LONGEST_NAME = 100
+"""Longest name of a task or step, in characters: panels and pages show it beside other things."""
 _PLAIN = re.compile(r"[A-Za-z][\w ./-]*")
 _WORDS = ("true", "false", "null")
 
@@ -70,8 +73,16 @@ def read_task(text: str, file: str, parameters: Sequence[str] = (), *, expands: 
         values[name] = parse_yaml(value, flag).root
     filled = _PARAMETER.sub(lambda match: _shown(values[match[1]]) if match[1] in values else match[0], text)
     document = parse_yaml(filled, file, expands=expands)
-    for key, name in _unfilled(document.root, ()):
+    for key, name in _unfilled(document.root):
         document.add(key, f"no parameter {name!r}{did_you_mean(name, list(values), 'parameters')}")
+    for key, words in _texts(document.root, ()):
+        if key[-1:] == ("name",) and not (words.isprintable() and len(words) <= _LONGEST_NAME):
+            document.add(
+                key,
+                f"a name is one line of at most {_LONGEST_NAME} characters that show, got {words[:_LONGEST_NAME]!r}",
+            )
+        elif not all(map(_is_shown, words)):
+            document.add(key, f"{words[:_LONGEST_NAME]!r} has control characters")
     document.raise_problems()
     task = single_options(Task, (), file, text=filled, expands=expands)
     return TaskFile(attrs.evolve(task, name=task.name or Path(file).stem), document)
@@ -84,14 +95,25 @@ def _shown(value: Any) -> str:
     return json.dumps(value)
 
 
-def _unfilled(value: Any, key: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], str]]:
+def _unfilled(value: Any) -> Iterator[tuple[tuple[str | int, ...], str]]:
     """Key and name of each parameter that was not filled in."""
-    if isinstance(value, str):
-        for match in _PARAMETER.finditer(value):
+    for key, text in _texts(value, ()):
+        for match in _PARAMETER.finditer(text):
             yield key, match[1]
+
+
+def _texts(value: Any, key: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    """Each text in a document, with its key."""
+    if isinstance(value, str):
+        yield key, value
     elif isinstance(value, Mapping):
         for name, item in value.items():
-            yield from _unfilled(item, (*key, name))
+            yield from _texts(item, (*key, name))
     elif isinstance(value, list):
         for i, item in enumerate(value):
-            yield from _unfilled(item, (*key, i))
+            yield from _texts(item, (*key, i))
+
+
+def _is_shown(character: str) -> bool:
+    """Whether a text may have a character, as in requests: a YAML can escape any."""
+    return character in "\t\n" or category(character) not in ("Cc", "Cs")
