@@ -318,6 +318,36 @@ def test_scripted_agent_does_ten_tasks_of_increasing_length(tmp_path: Path, kind
     assert re.fullmatch(r"joined armed( called)+ left ended", " ".join(events))
 
 
+@pytest.mark.long
+def test_agent_of_the_how_to_picks_up_the_cube(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs/how-to/let-an-agent-use-the-robot.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    (tmp_path / "pick.py").write_text(code, encoding="utf-8")
+    program = tmp_path / "bin" / "ibrobot"  # the client passes few variables on
+    program.parent.mkdir()
+    call = f"exec {sys.executable} -c 'from ibrobot_core.cli.command import main; main()' \"$@\""
+    program.write_text(
+        f"#!/bin/sh\nexport XDG_RUNTIME_DIR={tmp_path} XDG_STATE_HOME={tmp_path}\n{call}\n", encoding="utf-8"
+    )
+    program.chmod(0o755)
+    environment = {**os.environ, "PATH": f"{program.parent}:{os.environ['PATH']}", "PYTHONUNBUFFERED": "1"}
+    agent = subprocess.Popen(
+        [sys.executable, tmp_path / "pick.py"],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert agent.stdout is not None
+    with agent:
+        assert "ask a person" in agent.stdout.readline()
+        grant = [program, "agent", "arm", "--seconds", "120", "--speed", "0.5"]
+        granted = subprocess.run(grant, input="y\n", capture_output=True, text=True, check=True)
+        assert "it asks for: /task/run" in granted.stdout
+        said = [line for line in agent.stdout.read().splitlines() if not line.startswith("refused:")]
+    assert [each.strip() for each in said] == ["SUCCEEDED", "the cube is in the bin: True"]
+
+
 def test_agents_read_the_robot_without_its_secrets(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AGENT_TOKEN", "hunter2-hunter2-hunter2")
     config = load_config(

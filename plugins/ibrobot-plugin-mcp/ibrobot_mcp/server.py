@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+import logging
 import os
 import sys
 import time
@@ -120,6 +121,9 @@ class Client:
     """Calls that are not done yet."""
     waiting_stops: set[Callable[[], Any]] = attrs.field(factory=set)
     """Stops, likewise."""
+
+
+logging.getLogger("mcp").setLevel(logging.ERROR)  # it warns of what agents send: a flood would hide the run's own lines
 
 
 class AgentServer:
