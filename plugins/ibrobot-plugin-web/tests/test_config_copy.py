@@ -90,6 +90,17 @@ def test_it_asks_in_a_terminal_for_each_variable(source: Path) -> None:
     assert "${MINI_PORT:/dev/full}" in Path("desk.yaml").read_text()
 
 
+@pytest.mark.parametrize(
+    ("target", "message"),
+    [("mini.yaml", "exists already, and is not overwritten"), ("lab/desk.yaml", "there is no folder lab")],
+)
+def test_a_file_that_cannot_be_made_is_refused_before_the_questions(source: Path, target: str, message: str) -> None:
+    with Terminal("config", "copy", "mini.yaml", target) as terminal:
+        terminal.wait_for(message)
+        assert terminal.end() == 2
+        assert "MINI_PORT [" not in terminal.screen
+
+
 def test_a_variable_of_the_environment_is_the_usual_answer_and_outranks_another(
     source: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -52,6 +52,13 @@ def _line_of(source: Path, name: str) -> str:
     return next(line.strip() for line in _read(source).splitlines() if f"${{{name}" in line.partition(" #")[0])
 
 
+def _refuse_to_overwrite(copy: Path) -> None:
+    if os.path.lexists(copy):
+        raise ConfigError([Problem(copy, 0, "", "exists already, and is not overwritten")])
+    if not copy.parent.is_dir():
+        raise ConfigError([Problem(copy, 0, "", f"cannot be written: there is no folder {copy.parent}")])
+
+
 def write_copy(source: Path, copy: Path, defaults: Mapping[str, str]) -> None:
     """Copy a robot YAML, with comments, packages and variables as they are.
 
@@ -80,9 +87,8 @@ def write_copy(source: Path, copy: Path, defaults: Mapping[str, str]) -> None:
     try:
         with copy.open("x", encoding="utf-8") as file:
             file.write(VARIABLE.sub(replace, text))
-    except FileExistsError:
-        raise ConfigError([Problem(copy, 0, "", "exists already, and is not overwritten")]) from None
     except OSError as error:
+        _refuse_to_overwrite(copy)
         raise ConfigError([Problem(copy, 0, "", f"cannot be written: {error.strerror}")]) from error
 
 
@@ -113,6 +119,7 @@ class CopyConfig:
                 raise RequestError(f"--value: expected NAME=VALUE, got {each!r}")
             chosen[name] = value
         variables = variables_of(source)
+        _refuse_to_overwrite(self.copy)
         if not self.defaults and sys.stdin.isatty():
             for name, default in variables.items():
                 if name not in chosen:
