@@ -234,6 +234,18 @@ def test_dragging_the_ball_moves_the_tool_until_the_page_is_left(tab: Tab) -> No
     mouse.up()
 
 
+@pytest.mark.parametrize(
+    ("top", "target", "distance"),
+    [(0.3, [0, 0, 0], 2.0), (1.2, [0, 0, 0.6], 2.0), (3.0, [0, 0, 1.5], 1.2 * 1.5 / 0.4)],
+)
+def test_an_arm_that_stands_upright_is_in_sight_as_a_whole(
+    tab: Tab, top: float, target: list[float], distance: float
+) -> None:
+    points = [[0, 0, 0], [0, 0, top]]
+    framed = tab.ask(f"import('./static/matrix.js').then((all) => all.framed({points}, [0, 0, 0], 2, 0.4))")
+    assert framed == {"target": target, "distance": pytest.approx(distance)}
+
+
 def test_one_operates_the_other_watches_and_takes_over(chromium: Any, address: str, tab: Tab) -> None:
     tab.until(lambda: tab.ask("ibrobot.operating"))
     other = Tab(chromium, address, viewport={"width": 390, "height": 844})

@@ -81,7 +81,9 @@ class NewPlugin:
         for file, text in lists.items():
             file.write_text(text, encoding="utf-8")
         listed = [str(file.relative_to(repository.root)) for file in lists] if repository is not None else []
-        return {"folder": str(folder), "files": sorted(files), "entered": listed}
+        robot = next(text for path, text in files.items() if "/" not in path and path.endswith(".yaml"))
+        command = robot.partition("\n")[0].partition(": ")[2]  # at the top of the file
+        return {"folder": str(folder), "files": sorted(files), "entered": listed, "command": command}
 
     def show(self, made: dict[str, Any]) -> None:
         """Print what comes next."""
@@ -95,7 +97,7 @@ class NewPlugin:
         here = Path(sys.executable)
         python = "python" if Path(shutil.which("python") or "").parent == here.parent else shlex.quote(str(here))
         echo(f"next: cd {made['folder']} && {how_to_install('-e', '.[test]')} && {python} -m pytest")
-        echo("then: the command at the top of its robot YAML")
+        echo(f"then: `{made['command']}`")
 
 
 def render(kind: str, name: str, *, outside: bool = True) -> dict[str, str]:

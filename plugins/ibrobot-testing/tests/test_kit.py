@@ -178,6 +178,12 @@ def test_folder_that_is_a_file_is_an_error(tmp_path: Path) -> None:
         NewPlugin("teleop", "wave", tmp_path / "here")()
 
 
+def test_it_prints_the_command_that_runs_the_new_plugin(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    new = NewPlugin("teleop", "my_stick", tmp_path)
+    new.show(new())
+    assert re.search(r"^then: `ibrobot launch my_stick\.yaml .*`$", capsys.readouterr().out, re.MULTILINE)
+
+
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
     """A checkout of the repository, as far as `new` looks at it."""

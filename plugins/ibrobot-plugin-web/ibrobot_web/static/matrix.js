@@ -60,3 +60,15 @@ export function looking(from, to) {
   ]);
   return { matrix, right, up, ahead };
 }
+
+// Where to look, and from how far, so that all points are in sight: as given if they are.
+// `half`: half the height of what is seen at a distance of 1.
+export function framed(points, target, distance, half) {
+  const reach = (from) => 1.2 * Math.max(...points.map((point) => length(subtract(point, from))));
+  if (!points.length || reach(target) <= distance * half) return { target, distance };
+  const centre = [0, 1, 2].map((i) => {
+    const values = points.map((point) => point[i]);
+    return (Math.min(...values) + Math.max(...values)) / 2;
+  });
+  return { target: centre, distance: Math.max(distance, reach(centre) / half) };
+}

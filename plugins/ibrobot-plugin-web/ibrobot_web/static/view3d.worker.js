@@ -2,7 +2,7 @@
 
 import { Canvas3D, primitive } from "./canvas3d.js";
 import {
-  add, dot, identity, length, looking, multiply, perspective, placed, shifted, subtract, transform, turned,
+  add, dot, framed, identity, length, looking, multiply, perspective, placed, shifted, subtract, transform, turned,
 } from "./matrix.js";
 
 const PATH_POINTS = 300;
@@ -23,6 +23,7 @@ let measured = null, commanded = null, planned = null;
 let trail = [], path, future, grid, ball;
 let dirty = true, stamp = 0, drawn = 0, size = [1, 1], jogs = false, view = null;
 let cameras = [];
+let fresh = false; // a model that no state has posed yet: its file's extent is that of joints at 0
 let near = []; // names of bodies and objects that the guard keeps apart
 const shapes = new Map(); // of objects, by type and size
 let goals = false, goal = null, kept = false, begun = 0;
@@ -71,6 +72,7 @@ function load({ scene }) {
     { body, local: placed(pos, quat), shape: screen.line(frustum(fovy), true) }));
   orbit.distance = Math.max(0.45, 1.5 * scene.extent);
   orbit.target = scene.centre;
+  fresh = true;
   dirty = true;
 }
 
@@ -110,6 +112,8 @@ function items(frames, color = null) {
 function state({ state: message }) {
   if (!bodies.length || !joints.length) return;
   measured = posed(message.position);
+  if (fresh) Object.assign(orbit, framed(measured.map((frame) => transform(frame, [0, 0, 0])), orbit.target, orbit.distance, half()));
+  fresh = false;
   stamp = message.stamp / 1e6;
   const away = message.command.some((value, i) => Math.abs(value - message.position[i]) > GHOST_RAD);
   commanded = away ? posed(message.command) : null;
