@@ -354,6 +354,13 @@ def test_an_object_that_leaves_a_region_may_be_touched_no_more(tmp_path) -> None
     assert reached(loop, cube)
 
 
+def test_a_region_names_links_and_no_sites(tmp_path) -> None:
+    region = RegionOptions((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), ("hand", "tip"))
+    (fault,) = ClearanceGuardOptions(regions={"tray": region}).check(make_robot(tmp_path), ())
+    assert "unknown link 'tip'" in str(fault)
+    assert "base, turret, upper, lower, wrist, hand, finger" in str(fault)
+
+
 ODD_NAMES = ("cloud in tray", "cloud", "floor", "floor of the world")
 CELLS = np.array([[15, 0, 5], [18, 0, 5], [30, 0, 5]])
 
@@ -867,7 +874,11 @@ class TestFeed:
             assert known.objects == world.objects
         assert len(sent) == len(steps) - 1
 
-    def test_a_world_that_is_still_awaited_is_not_stale(self) -> None:
-        feed, sent = self.make([ObservedWorld(World(WALL), refusal="nothing has come", is_awaited=True)])
+    def test_a_world_that_is_still_awaited_is_not_known(self) -> None:
+        """Until the first message of a cloud, the arm must not move as if nothing were there."""
+        worlds = [ObservedWorld(World(WALL), refusal="nothing has come", is_awaited=True)]
+        feed, sent = self.make(worlds)
         feed._update()
-        assert [each.stale for each in sent] == [""]
+        worlds.append(ObservedWorld(World(WALL)))
+        feed._update()
+        assert [each.stale for each in sent] == ["nothing has come", ""]

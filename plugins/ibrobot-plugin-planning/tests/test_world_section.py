@@ -121,6 +121,18 @@ def test_no_object_is_put_down_farther_away_than_objects_may_be(run) -> None:
     assert run.call(SNAPSHOT).objects["ball"].link == "hand"
 
 
+def test_what_gets_the_name_of_a_removed_object_may_not_be_touched(run) -> None:
+    thing = {"shape": "box", "size": [0.1, 0.1, 0.1]}
+    run.call(TOUCH, {"objects": ["can", "ball"]})
+    run.call(ADD, {"name": "can", "object": thing, "replace": True})
+    assert "hand" in run.call(SNAPSHOT).objects["can"].may_touch, "it is still what the hand grasps"
+    run.call(REMOVE, {"name": "can"})
+    run.call(ADD, {"name": "can", "object": thing})
+    objects = run.call(SNAPSHOT).objects
+    assert objects["can"].may_touch == frozenset()
+    assert "hand" in objects["ball"].may_touch
+
+
 def test_objects_come_from_the_yaml(run):
     objects = run.call(SNAPSHOT, None).objects
     assert {name: type(thing.shape) for name, thing in objects.items()} == {

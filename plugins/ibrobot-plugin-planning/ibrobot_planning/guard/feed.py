@@ -41,7 +41,7 @@ class GuardFeed(SessionWorker):
 
     def _update(self) -> None:
         observed = observed_world(self.session.bus)
-        stale = "" if observed.is_awaited else observed.refusal
+        stale = observed.refusal  # also while the first message of a cloud is awaited: nobody knows what is there
         world = self._meshes.simple(observed.world)
         if world == self._sent and stale == self._stale:
             return

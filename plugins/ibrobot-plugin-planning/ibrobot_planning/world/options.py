@@ -206,7 +206,7 @@ class WorldOptions(Options):
 
 
 def link_names(robot: Robot) -> list[str]:
-    """Links and sites of the robot's MJCF; none without one, or if it cannot be read, which its own check reports."""
+    """Links of the robot's MJCF; none without one, or if it cannot be read, which its own check reports."""
     from ibrobot_kinematics.errors import KinematicsError
     from ibrobot_kinematics.mjcf_names import read_names
 
@@ -217,7 +217,7 @@ def link_names(robot: Robot) -> list[str]:
     except KinematicsError:
         return []
     prefixes = tuple(robot.description.arms) or ("",)
-    return [prefix + name for prefix in prefixes for name in ("world", *model.bodies, *model.sites)]
+    return [prefix + name for prefix in prefixes for name in ("world", *model.bodies)]
 
 
 def _short(instance: object, attribute: attrs.Attribute[str], value: str) -> None:

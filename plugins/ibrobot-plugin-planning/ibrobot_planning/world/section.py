@@ -180,7 +180,7 @@ class WorldKeeper(Component):
             OBSERVED: lambda _: self.observed(),
             SHAPES: lambda _: simple_objects(self.observed().world),
             ADD: self._add,
-            REMOVE: self._changing(lambda world, it: world.remove(it.name)),
+            REMOVE: self._changing(self._remove),
             MOVE: self._changing(self._move),
             ATTACH: self._changing(self._attach),
             DETACH: self._changing(self._detach),
@@ -421,6 +421,12 @@ class WorldKeeper(Component):
                 f"{text!r} has {path.stat().st_size} bytes; a request names meshes of up to {LARGEST_MESH}"
             )
         return path
+
+    def _remove(self, world: World, it: Named) -> World:
+        world = world.remove(it.name)
+        # Another object that gets the name later must not be touched for that.
+        self._touched = tuple(name for name in self._touched if name != it.name)
+        return world
 
     def _attach(self, world: World, it: Attached) -> World:
         self._no_cloud(it.name)
