@@ -105,3 +105,13 @@ def test_a_cable_at_no_joint_is_refused(cable: int, known: int) -> None:
     ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert ran.returncode == 2
     assert f"--cable: servo {cable} has no joint of an SO-101; ids are 1 to {known}" in ran.stderr
+
+
+@pytest.mark.parametrize("option", [("--mechanics", "--cable"), ("--error",)])
+@pytest.mark.parametrize("values", [("30", "30"), ("30", "12")])
+def test_a_servo_is_given_once_to_an_option(option: tuple[str, ...], values: tuple[str, ...]) -> None:
+    given = [word for value in values for word in (option[-1], "3", value)]
+    command = (*ibrobot_command(), "feetech", "emulate", *option[:-1], option[-1], "2", "5", *given)
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert ran.returncode == 2
+    assert f"{option[-1]}: servo 3 is given twice, with {values[0]} and with {values[1]}; give it once" in ran.stderr

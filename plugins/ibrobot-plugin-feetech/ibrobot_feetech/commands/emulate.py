@@ -94,6 +94,7 @@ class Emulate:
             raise RequestError("--mechanics and --physics exclude each other: either moves the joints")
         if self.swing and (self.physics is not None or self.mechanics):
             raise RequestError("--swing excludes --physics and --mechanics: something else moves the joints there")
+        cables, errors = _by_servo("--cable", self.cables), _by_servo("--error", self.errors)
         ended = threading.Event()
         on_signals(ended.set)
         config = _config(self.physics) if self.physics is not None else None
@@ -112,9 +113,9 @@ class Emulate:
             faults = emulator.faults
             faults.silent, faults.blocked = set(self.silent), set(self.blocked)
             faults.overloaded, faults.disconnected = set(self.overloaded), set(self.disconnected)
-            faults.errors = dict(self.errors)
+            faults.errors = errors
             if self.mechanics:
-                _add_mechanics(emulator, joints, dict(self.cables))
+                _add_mechanics(emulator, joints, cables)
             calibrated = _calibrate(emulator, self.calibration, joints, config.robot if config is not None else None)
             echo(str(self.link) if self.link is not None else emulator.port)
             arm = None
@@ -127,6 +128,18 @@ class Emulate:
             echo(f"{count} servos at {self.baud} baud; Ctrl-C ends it", err=True)
             hand = Hand(emulator, self.swing) if self.swing else None
             _wait(ended, arm, hand)
+
+
+def _by_servo(typed: str, pairs: Sequence[tuple[int, int]]) -> dict[int, int]:
+    """The values of an option by servo; raises RequestError if it names one twice."""
+    found: dict[int, int] = {}
+    for servo, value in pairs:
+        if servo in found:
+            raise RequestError(
+                f"{typed}: servo {servo} is given twice, with {found[servo]} and with {value}; give it once"
+            )
+        found[servo] = value
+    return found
 
 
 def _add_mechanics(emulator: Emulator, joints: Sequence[str], cables: Mapping[int, int]) -> None:
