@@ -34,7 +34,7 @@ class Hand:
     """What a person does with a pointer and a keyboard, counted."""
 
     def __init__(self) -> None:
-        self.clicks = self.keys = self.characters = self.tabs = 0
+        self.clicks = self.keys = self.characters = self.tabs = self.lost = 0
 
     def press(self, element: Any) -> None:
         """Press a button or follow a link."""
@@ -42,7 +42,7 @@ class Hand:
         self.clicks += 1
 
     def type(self, element: Any, text: str) -> None:
-        """Type into a field that is empty."""
+        """Type into a field, in place of what it contains."""
         element.click()
         self.clicks += 1
         element.fill(text)
@@ -61,11 +61,16 @@ class Hand:
 
     def total(self) -> dict[str, int]:
         """The counts."""
-        return dict(vars(self))
+        return {name: value for name, value in vars(self).items() if not name.startswith("_")}
 
 
 class Keyboard(Hand):
     """A person without a pointer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._seen = set[Any]()
+        """Pages on which something had the focus."""
 
     def press(self, element: Any) -> None:
         self._reach(element)
@@ -74,6 +79,7 @@ class Keyboard(Hand):
 
     def type(self, element: Any, text: str) -> None:
         self._reach(element)
+        element.page.keyboard.press("Control+a")
         element.page.keyboard.type(text)
         self.characters += len(text)
 
@@ -89,6 +95,10 @@ class Keyboard(Hand):
         """Go to an element by the tab key."""
         page = element.page
         element.wait_for(timeout=_WAIT_MS)
+        if page in self._seen and page.evaluate("document.activeElement === document.body"):
+            self.lost += 1
+            print(f"before {element}: the focus was lost", flush=True)
+        self._seen.add(page)
         for _ in range(_TABS):
             if element.evaluate("each => each === document.activeElement"):
                 shown = element.evaluate("each => each.matches(':focus-visible')")
@@ -184,9 +194,7 @@ def train(hand: Hand, page: Any, look_at: Any) -> None:
     hand.press(button(page, "Train", "link", ".job:visible"))
     labelled(page, "Steps").wait_for()
     until(page, "!document.querySelector('#view-job-train form button.primary').disabled")
-    if (steps := labelled(page, "Steps")).input_value():
-        steps.fill("")
-    hand.type(steps, "50")
+    hand.type(labelled(page, "Steps"), "50")
     look_at(page, "way-10-train")
     hand.press(button(page, "Train", within="#main"))
     page.locator(".job:visible .state.running").first.wait_for(timeout=_WAIT_MS)
@@ -215,13 +223,12 @@ def launch(hand: Hand, page: Any, look_at: Any) -> None:
     look_at(trained, "way-15-runs")
     page.bring_to_front()
     look_at(page, "way-16-running")
-    other = page.context.new_page()
-    other.goto(page.url.split("#")[0])
-    look.view(other, "jobs")
-    button(other, "Stop the run").first.click()
-    other.locator(".job .state.running").wait_for(state="hidden", timeout=_WAIT_MS)
-    other.close()
+    trained.bring_to_front()
+    hand.press(button(trained, "End the run", within="#toggles"))
+    hand.press(button(trained, "End the run", within="#dialog"))
+    until(trained, "ibrobot.status.ended")
     trained.close()
+    page.bring_to_front()
 
 
 def evaluate(hand: Hand, page: Any, look_at: Any) -> None:
@@ -230,7 +237,6 @@ def evaluate(hand: Hand, page: Any, look_at: Any) -> None:
     button(page, "Evaluate", within="#main").wait_for()
     page.wait_for_timeout(1500)
     look_at(page, "way-17-evaluate")
-    page.locator("#field-episodes").fill("")
     hand.type(page.locator("#field-episodes"), "2")
     hand.press(button(page, "Evaluate", within="#main"))
     page.locator(".job:visible .state.done").first.wait_for(timeout=10 * _WAIT_MS)
@@ -292,7 +298,7 @@ def main() -> None:
                     look.view(other, name)
                     look_at(other, f"filled-{name}")
     print("all", hand.total(), f"{eye.wrong} serious or critical", *problems, sep="\n")
-    sys.exit(1 if eye.wrong or problems else 0)
+    sys.exit(1 if eye.wrong or problems or hand.lost else 0)
 
 
 if __name__ == "__main__":

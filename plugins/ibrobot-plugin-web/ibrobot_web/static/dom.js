@@ -27,7 +27,22 @@ export function refresh(element, description, make) {
   const key = JSON.stringify(description);
   if (element.dataset.key === key) return;
   element.dataset.key = key;
-  element.replaceChildren(...[make()].flat().map(words));
+  replace(element, make());
+}
+
+const CONTROLS = "a, button, input, select, textarea, summary, [tabindex='0']";
+const nameOf = (control) => `${control.localName} ${control.getAttribute("aria-label") ?? (control.id || control.textContent)}`;
+
+// Replaces an element's children. If one of them had the focus, that of the same name gets it, or else the element: a key
+// that is pressed twice does not press another button.
+export function replace(element, ...children) {
+  const before = document.activeElement;
+  const name = before !== element && element.contains(before) ? nameOf(before) : null;
+  element.replaceChildren(...children.flat().map(words));
+  if (name === null) return;
+  const same = [...element.querySelectorAll(CONTROLS)].find((each) => nameOf(each) === name && !each.disabled);
+  if (!same && !element.hasAttribute("tabindex")) element.tabIndex = -1;
+  (same ?? element).focus({ preventScroll: true });
 }
 
 // A table: the names of its columns, and its rows. On a phone each row is a card, whose values have these names.
@@ -47,6 +62,9 @@ export function row(cells, properties = {}) {
     return i ? h("td", {}, cell) : h("th", { scope: "row" }, cell);
   }));
 }
+
+// Gives the focus to an element, unless something else has it: a browser drops it from what is disabled or replaced.
+export function regain(element) { if (document.activeElement === document.body || !document.activeElement) element.focus({ preventScroll: true }); }
 
 // A part that scrolls, by keys too.
 export function scroll(label, ...content) {

@@ -54,8 +54,8 @@ def listing(ui: Ui) -> list[dict[str, str]]:
 
 
 def robot_names(ui: Ui) -> list[str]:
-    """The robots to choose from, as requests name them."""
-    return [*shipped_configs(installed_plugins()), *(ui.folders.name(path) for path in _yamls(ui))]
+    """The robots to choose from, as requests name them: one's own first."""
+    return [*(ui.folders.name(path) for path in _yamls(ui)), *shipped_configs(installed_plugins())]
 
 
 def _yamls(ui: Ui) -> Iterator[Path]:

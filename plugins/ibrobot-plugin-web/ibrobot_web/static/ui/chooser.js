@@ -68,7 +68,7 @@ export class Chooser {
     const asked = ++this.asked;
     this.robot.value = choice.robot;
     for (const radio of this.body.querySelectorAll("input")) radio.checked = radio.dataset.sim === String(choice.sim);
-    this.summary.textContent = this.robots?.find(({ robot }) => robot === choice.robot)?.summary ?? "";
+    this.summary.textContent = words(this.robots?.find(({ robot }) => robot === choice.robot)?.summary ?? "");
     if (!choice.robot) return;
     let found;
     try {

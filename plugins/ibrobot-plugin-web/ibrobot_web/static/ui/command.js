@@ -1,6 +1,6 @@
 // View: a command that runs as a job: its form, and what it has done.
 
-import { h } from "../dom.js";
+import { h, regain } from "../dom.js";
 import { Form } from "./form.js";
 import { JobList } from "./job.js";
 
@@ -43,9 +43,13 @@ export class View {
     this.form.button.disabled = true;
     localStorage.setItem(this.key, JSON.stringify(values));
     const started = await this.ui.attempt(() => this.ui.post("jobs/start", { command: this.command, values }));
-    const show = () => this.jobs.cards.get(started.number)?.element.scrollIntoView({ block: "nearest" });
-    if (started) setTimeout(show, 300); // once its card is there
     this.form.button.disabled = !this.ui.drives;
+    if (!started) { regain(this.form.button); return; }
+    setTimeout(() => { // once its card is there
+      const { element } = this.jobs.cards.get(started.number) ?? {};
+      element?.scrollIntoView({ block: "nearest" });
+      regain(element ?? this.form.button); // the next steps follow in it
+    }, 300);
   }
 
   job(job) {

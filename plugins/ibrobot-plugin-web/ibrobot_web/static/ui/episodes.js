@@ -1,6 +1,6 @@
 // View: recorded episodes.
 
-import { confirm, h, refresh, row, say, scroll, table, toast, when } from "../dom.js";
+import { confirm, h, refresh, replace, row, say, scroll, table, toast, when } from "../dom.js";
 import { RUNS } from "./job.js";
 import { keyed, press } from "./keys.js";
 import { Player } from "./player.js";
@@ -80,10 +80,11 @@ export class View {
   draw() {
     const rows = this.shownRows();
     const { drives } = this.ui;
+    const troubled = rows.some(({ problems }) => problems.length);
     refresh(this.bulk, [[...this.chosen], drives, rows.length], () => this.bulkControls(rows));
     refresh(this.table, [rows, [...this.chosen], this.path], () => (rows.length ? [table(
-      [this.box("Choose all", rows), "Episode", "Task", "Length", "Began", "Size", "Outcome", "Problems"],
-      rows.map((each) => this.row(each)))] : []));
+      [this.box("Choose all", rows), "Episode", "Task", "Length", "Began", "Size", "Outcome", ...(troubled ? ["Problems"] : [])],
+      rows.map((each) => this.row(each, troubled)))] : []));
   }
 
   // A box that chooses episodes.
@@ -97,14 +98,14 @@ export class View {
     return box;
   }
 
-  row(each) {
+  row(each, troubled) {
     const place = each.group === "." ? each.name : `${each.group}/${each.name}`;
     return row([h("td", {}, this.box(`Choose ${each.name} of ${each.group}`, [each])),
       h("th", { scope: "row" }, h("a", { href: `#episodes/${encodeURIComponent(each.path)}` }, place)),
       h("td", { class: each.task.length > 30 ? "text" : "" }, each.task || h("span", { class: "note" }, "none")),
       each.duration_s === null ? "" : `${each.duration_s.toFixed(1)} s`, began(each.began_s), size(each.bytes),
       h("td", { class: { success: "good", failure: "bad" }[each.outcome] ?? "" }, each.outcome),
-      h("td", { class: each.problems.length ? "bad text" : "" }, each.problems.join("; "))],
+      ...(troubled ? [h("td", { class: each.problems.length ? "bad text" : "" }, each.problems.join("; "))] : [])],
     { class: each.path === this.path ? "current" : "" });
   }
 
@@ -119,18 +120,19 @@ export class View {
   }
 
   async open(path) {
+    if (path !== this.path) this.controls.replaceChildren(); // they act on the former one
     this.path = path;
     this.draw();
     this.detail.hidden = !path;
     if (!path) { this.player.close(); return; }
     say(this.title, path);
-    this.about.replaceChildren(h("p", { class: "note" }, "Opening …"));
-    this.controls.replaceChildren();
+    replace(this.about, h("p", { class: "note" }, "Opening …"));
     this.player.setCut(null);
     const facts = await this.player.open(path, this.about);
-    if (!facts || this.path !== path) return;
+    if (this.path !== path) return;
+    if (!facts) { this.controls.replaceChildren(); return; }
     const { metadata, topics } = facts;
-    this.about.replaceChildren(
+    replace(this.about,
       h("p", {}, [metadata.robot, metadata.mode, facts.task && `“${facts.task}”`, facts.outcome, metadata.trimmed && `trimmed: ${metadata.trimmed}`]
         .filter(Boolean).join(" · ")),
       ...facts.problems.map((problem) => h("div", { class: "problem" }, problem)));
@@ -155,7 +157,7 @@ export class View {
     const end = h("button", { disabled: off, onclick: () => { cut[1] = Math.min(facts.duration_s, Math.max(round(player.at), cut[0])); show(); } }, "End here");
     const whole = h("button", { disabled: off, onclick: () => { cut[0] = 0; cut[1] = facts.duration_s; show(); } }, "Whole");
     show();
-    this.controls.replaceChildren(
+    replace(this.controls,
       h("div", { class: "row" }, h("span", {}, "Judge:"), this.outcomes.map(([outcome, text]) => h("button", {
         disabled: off || !facts.finished, "aria-pressed": String(facts.outcome === outcome), "data-key": outcome[0],
         onclick: () => this.mark([path], outcome),

@@ -96,10 +96,12 @@ class Field {
       this.value = () => box.checked;
       this.enter = (entered) => { box.checked = Boolean(entered); };
     } else if (closed) {
-      const select = h("select", described, choices.map(([value, text]) => h("option", { value, selected: value === field.default }, text)));
+      const nothing = !field.required && field.default === null ? [["", "none"]] : [];
+      const offered = [...nothing, ...choices];
+      const select = h("select", described, offered.map(([value, text]) => h("option", { value, selected: value === field.default }, text)));
       this.elements = [label, h("div", {}, select, help)];
       this.value = () => select.value;
-      this.enter = (entered) => { if (choices.some(([value]) => value === entered)) select.value = entered; };
+      this.enter = (entered) => { if (offered.some(([value]) => value === entered)) select.value = entered; };
     } else {
       const number = field.kind !== "text";
       const input = h("input", {

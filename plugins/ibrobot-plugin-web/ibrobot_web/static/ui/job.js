@@ -8,6 +8,7 @@ import { words } from "../words.js";
 // What a job has made -> the view that shows it.
 const MADE = { dataset: ["datasets", "Open the dataset"], policy: ["policies", "Use it in a robot"], episode: ["episodes", "See the episode"], episodes: ["episodes", "Judge the episodes"] };
 export const RUNS = ["run", "record"];
+const SET_UP = "Set up"; // the group of views whose steps come first, or much later
 const STATES = { running: "running", done: "done", failed: "failed", cancelled: "ended" };
 
 // The title of a job begins with what the page calls its command; then it names files.
@@ -32,7 +33,7 @@ export class JobCard {
     this.made = h("div", { class: "row" });
     this.output = h("pre", { class: "output", tabindex: "0", "aria-label": "Output" });
     this.details = h("details", { ontoggle: () => { this.output.scrollTop = this.output.scrollHeight; } }, h("summary", {}, "Output"), this.output);
-    this.element = h("div", { class: "card job" }, h("div", { class: "row" }, this.title, this.state), this.progress,
+    this.element = h("div", { class: "card job", tabindex: "-1" }, h("div", { class: "row" }, this.title, this.state), this.progress,
       this.facts, this.question.element, this.error, this.plot, this.problems, this.made, this.controls, this.details);
   }
 
@@ -67,8 +68,10 @@ export class JobCard {
     const { views } = this.ui.session;
     const shows = MADE[kind] ?? views.filter(({ report }) => report === kind).map(({ name, title }) => [name, `Open in ${title}`])[0];
     const link = (name, rest, text) => h("a", { class: "button", href: `#${name}/${encodeURIComponent(rest)}` }, text);
+    const taking = views.filter(({ takes }) => takes?.[kind]);
+    const onward = [...taking.filter(({ group }) => group !== SET_UP), ...taking.filter(({ group }) => group === SET_UP)];
     return [shows && link(shows[0], path, shows[1]),
-      ...views.filter(({ takes }) => takes?.[kind]).map(({ name, title, takes }) => link(name, `${takes[kind]}=${path}`, title))].filter(Boolean);
+      ...onward.map(({ name, title, takes }) => link(name, `${takes[kind]}=${path}`, title))].filter(Boolean);
   }
 
   // The curve of the job, e.g. its loss over its steps.

@@ -17,6 +17,12 @@ export class Overview {
     this.element = h("div", { class: "overview" }, this.tiles, this.robots);
   }
 
+  // Marks the robot that is chosen now.
+  mark(robot) {
+    this.chosen = robot;
+    if (this.found) this.show(this.found);
+  }
+
   // Counts again; what was asked while it counts is asked once more.
   async load() {
     if (this.loading) { this.again = true; return; }
@@ -33,11 +39,12 @@ export class Overview {
   }
 
   show(found) {
+    this.found = found;
     const runs = [...this.ui.jobs.values()].filter(({ kind, state, facts }) => RUNS.includes(kind) && state === "running" && facts.url);
     refresh(this.tiles, [found, runs.map(({ number, facts }) => [number, facts.url])], () => [
       tile("Set up", this.setUp(found, runs)), tile("Record", record(found)), tile("Learn", learn(found)), tile("Evaluate", evaluate(found))]);
     const last = (robot) => [...this.ui.jobs.values()].filter(({ kind, title }) => kind === "run" && RUN_OF(robot).includes(title)).at(-1);
-    refresh(this.robots, found.robots.map(({ robot, summary }) => [robot, summary, last(robot)?.state, last(robot)?.facts.url]), () =>
+    refresh(this.robots, found.robots.map(({ robot, summary }) => [robot, summary, robot === this.chosen, last(robot)?.state, last(robot)?.facts.url]), () =>
       found.robots.map(({ robot, summary }) => tile(robot, this.robot(robot, summary, last(robot)), "h3")));
   }
 
@@ -46,7 +53,8 @@ export class Overview {
     const state = running ? "It runs." : run?.state === "failed" ? "Its last run failed." : run ? "Its last run has ended." : "Not running.";
     return [summary, h("p", { class: running ? "good" : run?.state === "failed" ? "bad" : "note" }, state), h("div", { class: "row" },
       running && run.facts.url ? h("a", { class: "button primary", href: this.ui.runAddress(run.facts.url), target: "_blank" }, "Open its page")
-        : h("button", { onclick: () => this.choose(robot), "aria-label": `Choose ${robot}` }, "Choose"))].filter(Boolean);
+        : robot === this.chosen ? h("span", { class: "note" }, "Chosen below.")
+          : h("button", { onclick: () => this.choose(robot), "aria-label": `Choose ${robot}` }, "Choose"))].filter(Boolean);
   }
 
   setUp({ robots }, runs) {
@@ -66,15 +74,16 @@ function record({ episodes, unjudged, newest }) {
 
 function learn({ episodes, datasets, policies }) {
   const text = `${count(datasets.length, "dataset")}, ${count(policies.length, "policy", "policies")}.`;
-  if (!datasets.length) return [text, episodes ? link("job-convert", "Convert the episodes") : null];
+  if (!datasets.length) return [text, episodes ? link("job-convert", "Convert the episodes") : note("Datasets are made of recorded episodes.")];
   return [text, policies.length ? link("policies", "Use a policy in a robot") : link("job-train", "Train a policy")];
 }
 
 function evaluate({ policies, reports }) {
   const text = reports ? `${count(reports, "evaluation")}.` : "No evaluation yet.";
-  return [text, reports ? link("report-evaluation", "See the results") : policies.length ? link("job-eval", "Evaluate a policy") : null];
+  return [text, reports ? link("report-evaluation", "See the results") : policies.length ? link("job-eval", "Evaluate a policy") : note("What is evaluated is a trained policy.")];
 }
 
+const note = (text) => h("p", { class: "note" }, text);
 const link = (view, text) => h("a", { class: "button", href: `#${view}` }, text);
 const count = (number, one, several = `${one}s`) => `${number} ${number === 1 ? one : several}`;
 

@@ -1,7 +1,8 @@
 // View: trained policies, which are put into robot YAMLs.
 
-import { h, problem, refresh, when } from "../dom.js";
+import { h, problem, refresh, replace, when } from "../dom.js";
 import { remember } from "./chooser.js";
+import { words } from "../words.js";
 
 export class View {
   constructor(ui) { this.ui = ui; }
@@ -14,7 +15,7 @@ export class View {
     this.robot = h("select", { id: "use-robot" });
     this.model = h("input", { type: "text", id: "use-model", placeholder: "the first of this type, or a new one" });
     this.mode = h("input", { type: "text", id: "use-mode", placeholder: "for a new model" });
-    this.change = h("div", { "aria-live": "polite" });
+    this.change = h("div", { "aria-live": "polite", tabindex: "-1" });
     this.look = h("button", { class: "primary", disabled: true }, "Show the change");
     this.none = h("p", { class: "note", hidden: true }, "No trained policies in the opened folders. Train one, or copy one into them.");
     const form = h("form", {}, h("div", { class: "fields" },
@@ -41,7 +42,7 @@ export class View {
     if (!found || !robots) return;
     robots.sort((one, other) => (other.source === "folder") - (one.source === "folder")); // own ones first
     fill(this.checkpoint, found.map(({ path }) => path),
-      found.map(({ path, changed_s: at }) => `${path} (${when(at)})`));
+      found.map(({ path, changed_s: at }) => `${short(path)} (${when(at)})`));
     const first = !this.robot.value;
     fill(this.robot, robots.map(({ robot }) => robot), robots.map(({ robot }) => robot));
     const { robot } = JSON.parse(sessionStorage.getItem("robot") ?? "{}"); // the one of the last run
@@ -56,7 +57,7 @@ export class View {
 
   // What was shown is of another choice.
   renew() {
-    this.change.replaceChildren();
+    replace(this.change, );
     if (this.linked && this.checkpoint.value && this.robot.value) this.preview();
   }
 
@@ -67,7 +68,7 @@ export class View {
     try {
       found = await this.ui.get("policies/preview", request);
     } catch (error) {
-      if (chosen()) this.change.replaceChildren(problem(error.message));
+      if (chosen()) replace(this.change, problem(error.message));
       return;
     }
     if (!chosen()) return; // another choice meanwhile
@@ -75,7 +76,7 @@ export class View {
       class: "primary", disabled: !this.ui.drives || found.problems.length > 0 || !found.diff.length,
       onclick: () => this.write(request, found),
     }, found.new ? `Write the new file ${found.target}` : `Write the file ${found.target}`);
-    this.change.replaceChildren(
+    replace(this.change, 
       found.diff.length ? h("pre", { class: "diff", tabindex: "0", "aria-label": "Change" }, found.diff.map((line) => (
         h("span", { class: line.startsWith("+") ? "added" : line.startsWith("-") ? "removed" : "" }, `${line}\n`))))
         : h("p", { class: "note" }, "The robot has this policy already."),
@@ -90,7 +91,7 @@ export class View {
     remember(launched);
     const evaluation = this.ui.session.views.find(({ name }) => name === "job-eval");
     const filled = `${evaluation?.takes.robot}=${done.robot}\nmode=${done.mode}\nsim=yes`;
-    this.change.replaceChildren(h("p", {}, `${done.robot} is written; its mode ${done.mode} runs the policy.`),
+    replace(this.change, h("p", {}, `${done.robot} is written; its mode ${done.mode} runs the policy.`),
       h("p", { class: "warned" }, "The robot moves by itself as soon as the run has started, until you stop it."),
       h("div", { class: "row" },
         h("button", { class: "primary", onclick: () => this.ui.openRun(() => this.ui.post("robots/launch", launched)) }, "Launch it in simulation"),
@@ -98,6 +99,12 @@ export class View {
         h("a", { class: "button", href: "#robots" }, "Choose how to launch it")));
     await this.load();
   }
+}
+
+// A checkpoint of a training by its step: TRAINING, step 5000.
+function short(path) {
+  const match = /^(.+)\/checkpoints\/0*(\d+)\/pretrained_model$/.exec(path);
+  return match ? words(`${match[1]}, step ${match[2]}`) : path;
 }
 
 function fill(select, values, texts) {

@@ -1,6 +1,6 @@
 // View: record a number of episodes of one task.
 
-import { h, say } from "../dom.js";
+import { h, regain, say } from "../dom.js";
 import { Chooser } from "./chooser.js";
 import { Form } from "./form.js";
 import { JobList } from "./job.js";
@@ -74,6 +74,7 @@ export class View {
     this.form.button.disabled = true;
     await this.ui.openRun(() => this.ui.post("record/start", { ...this.chooser.request, values }));
     this.enable();
+    regain(this.form.button);
   }
 
   job(job) {

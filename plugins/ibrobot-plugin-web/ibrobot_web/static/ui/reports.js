@@ -1,6 +1,6 @@
 // View: reports of one kind on folders with results, e.g. evaluations, and the recordings that they name.
 
-import { h, problem, refresh, row, say, scroll, table, toast, when } from "../dom.js";
+import { h, problem, refresh, replace, row, say, scroll, table, toast, when } from "../dom.js";
 import { Player } from "./player.js";
 
 const SVG = "http://www.w3.org/2000/svg";
@@ -8,8 +8,9 @@ const SHAPES = new Set(["svg", "g", "title", "text", "line", "rect", "circle", "
 const ATTRIBUTES = ["viewBox", "role", "x", "y", "x1", "y1", "x2", "y2", "cx", "cy", "r", "d", "points", "width", "height", "class", "text-anchor"];
 
 export class View {
-  constructor(ui, { name, title, report }) {
+  constructor(ui, { name, title, report, within }) {
     this.ui = ui;
+    this.within = within; // the view of the command that makes them
     this.name = name;
     this.title = title;
     this.kind = report;
@@ -47,7 +48,9 @@ export class View {
   async load() {
     const found = await this.ui.attempt(() => this.ui.get("reports/list", { kind: this.kind }));
     if (!found) return;
-    say(this.note, found.length ? "" : "None in the opened folders.");
+    const maker = this.ui.session.views.find(({ name }) => name === this.within);
+    this.note.replaceChildren(...(found.length ? [] : [h("span", {}, "None in the opened folders. "),
+      ...(maker ? [h("a", { href: `#${maker.name}` }, maker.title)] : [])]));
     refresh(this.list, [found, this.path], () => (found.length
       ? [table(["Folder", "Result", "Changed"], found.map((each) => this.row(each)))] : []));
   }
@@ -155,7 +158,7 @@ export class View {
 
   // The same buttons beside the player.
   drawMending() {
-    this.mending.replaceChildren(...(this.played ? this.fixes(this.played) : []));
+    replace(this.mending, ...(this.played ? this.fixes(this.played) : []));
   }
 
   // Plays a recording until it is closed, which leads back to where it was opened.

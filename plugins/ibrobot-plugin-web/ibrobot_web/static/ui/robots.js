@@ -1,6 +1,6 @@
 // View: choose a robot, see its problems, launch it, and stop it.
 
-import { h } from "../dom.js";
+import { h, regain } from "../dom.js";
 import { Chooser } from "./chooser.js";
 import { Copy } from "./copy.js";
 import { JobList, RUNS } from "./job.js";
@@ -40,6 +40,7 @@ export class View {
 
   enable() {
     this.copy.enable();
+    this.overview.mark(this.chooser.request.robot);
     this.launch.disabled = !this.chooser.ready || !this.ui.drives;
     const { found } = this.chooser;
     this.hint.textContent = found?.modes && !found.modes.some(({ jogs }) => Object.keys(jogs).length)
@@ -50,6 +51,7 @@ export class View {
     this.launch.disabled = true;
     await this.ui.openRun(() => this.ui.post("robots/launch", this.chooser.request));
     this.enable();
+    regain(this.launch);
   }
 
   job(job) {

@@ -1,0 +1,73 @@
+"""The pages by keys alone, in headless Chromium: what is replaced or disabled does not lose the focus."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ibrobot_core.app import installed_plugins
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium"),
+    pytest.mark.skipif(("hardware", "mujoco") not in installed_plugins().entries, reason="needs ibrobot-plugin-mujoco"),
+]
+REPLACED = """async ([before, after]) => {
+  const { h, refresh } = await import("/static/dom.js");
+  const place = h("div", {});
+  document.body.append(place);
+  const show = (texts) => refresh(place, texts, () => texts.map((text) => h("button", {}, text)));
+  show(before);
+  place.lastChild.focus();
+  show(after);
+  const focused = document.activeElement === place ? "the place" : document.activeElement.textContent;
+  place.remove();
+  return focused;
+}"""
+"""What has the focus after buttons of these texts, of which the last one had it, were replaced by others."""
+
+
+def reach(page: Any, element: Any) -> None:
+    """Go to an element by the tab key."""
+    element.wait_for()
+    for _ in range(120):
+        if element.evaluate("each => each === document.activeElement"):
+            assert element.evaluate("each => each.matches(':focus-visible')"), "the focus is visible"
+            return
+        page.keyboard.press("Tab")
+    raise AssertionError(f"{element}: not reached by the tab key")
+
+
+def test_focus_stays(tmp_path: Path) -> None:
+    sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
+    from ui_path import FLAGS, own_robot, ui_process
+
+    own_robot(tmp_path)
+    with ui_process(tmp_path) as address, sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        page = browser.new_page()
+        page.goto(address)
+        page.get_by_text("No problems found.").wait_for(timeout=60_000)
+        replaced = {
+            ("Success", "Failure"): ("Failure", "Success"),
+            ("Undo", "Play"): ("Play",),
+            ("Failure", "Play"): ("Play", "Failure"),
+        }
+        for after, before in replaced.items():
+            assert page.evaluate(REPLACED, [list(before), list(after)]) == before[-1]
+        for after in ([], ["Discard"], ["Begin again"]):
+            shown = page.evaluate(REPLACED, [["Redo", "Begin"], after])
+            assert shown == "the place", "a key that is pressed twice presses nothing else"
+
+        reach(page, page.locator("#nav [data-name='job-datasets check']"))
+        page.keyboard.press("Enter")
+        page.locator("#view-job-datasets-check").wait_for()
+        assert page.evaluate("document.activeElement.id") == "main"
+        reach(page, page.get_by_role("link", name="Checks"))
+        page.keyboard.press("Enter")
+        reach(page, page.locator("#main").get_by_role("link", name="Check", exact=True))
+        browser.close()
