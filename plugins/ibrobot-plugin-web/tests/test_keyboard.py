@@ -1,4 +1,4 @@
-"""The pages by keys alone, in headless Chromium: what is replaced or disabled does not lose the focus."""
+"""The pages by keys alone, in headless Chromium: what is replaced does not lose the focus; what cards of runs say."""
 
 from __future__ import annotations
 
@@ -31,6 +31,28 @@ REPLACED = """async ([before, after]) => {
 """What has the focus after buttons of these texts, of which the last one had it, were replaced by others."""
 
 
+FAILED = """async ([exit_code, lines]) => {
+  const { JobCard } = await import("/static/ui/job.js");
+  const card = new JobCard({ session: { views: [] }, drives: true });
+  card.update({ number: 1, title: "arm", kind: "run", state: "failed", exit_code, facts: {}, lines });
+  return card.error.textContent;
+}"""
+"""What the card of a failed run says of the cause."""
+BEGUN = """() => {
+  const { jobs } = ibrobot, arm = (number, facts) => ({ number, kind: "run", state: "running", facts, lines: [] });
+  jobs.clear();
+  const seen = [ibrobot.startsRun];
+  jobs.set(1, arm(1, {}));
+  seen.push(ibrobot.startsRun);
+  jobs.set(1, arm(1, { url: "http://127.0.0.1/" }));
+  seen.push(ibrobot.startsRun);
+  ibrobot.begun = 2;
+  seen.push(ibrobot.startsRun);
+  return seen;
+}"""
+"""Whether a run starts: none, one without a page, one with a page, and one that was just asked for."""
+
+
 def reach(page: Any, element: Any) -> None:
     """Go to an element by the tab key."""
     element.wait_for()
@@ -42,7 +64,7 @@ def reach(page: Any, element: Any) -> None:
     raise AssertionError(f"{element}: not reached by the tab key")
 
 
-def test_focus_stays(tmp_path: Path) -> None:
+def test_focus_stays_and_cards_say_what_happened(tmp_path: Path) -> None:
     sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
     from ui_path import FLAGS, own_robot, ui_process
 
@@ -63,6 +85,10 @@ def test_focus_stays(tmp_path: Path) -> None:
             shown = page.evaluate(REPLACED, [["Redo", "Begin"], after])
             assert shown == "the place", "a key that is pressed twice presses nothing else"
 
+        assert "by signal 9" in page.evaluate(FAILED, [-9, ["mode web | loop 100 Hz"]])
+        assert page.evaluate(FAILED, [1, ["mode web | loop 100 Hz", "error: no arm"]]) == "exit code 1\nno arm"
+        assert page.evaluate(BEGUN) == [False, True, False, True]
+
         reach(page, page.locator("#nav [data-name='job-datasets check']"))
         page.keyboard.press("Enter")
         page.locator("#view-job-datasets-check").wait_for()
@@ -71,3 +97,4 @@ def test_focus_stays(tmp_path: Path) -> None:
         page.keyboard.press("Enter")
         reach(page, page.locator("#main").get_by_role("link", name="Check", exact=True))
         browser.close()
+

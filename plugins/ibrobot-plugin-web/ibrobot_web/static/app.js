@@ -181,7 +181,7 @@ function showFaults() {
       unconfirmed ? h("div", { class: "fault alarm" }, h("strong", {}, "The robot may not have stopped: "), h("span", {},
         `STOP is not confirmed (${unconfirmed}). Press Esc in the terminal of the run, or switch off the robot's power.`)) : null,
       lost ? h("div", { class: "fault" }, h("strong", {}, "No connection to the run. "), h("span", {},
-        "It has ended, or the network is down. STOP on this page has no effect. The page keeps trying.")) : null,
+        "It has ended, or the network is down. STOP on this page has no effect. The page keeps trying."), ...toHome()) : null,
       ...faults.map(({ text, remedy }) => h("div", { class: "fault" },
         h("strong", {}, "Fault: "), h("span", {}, `${text}. The robot holds. ${remedy}`), reset())),
       estop && !faults.length ? h("div", { class: "fault" }, h("strong", {}, "Emergency stop. "), reset()) : null,
@@ -209,11 +209,21 @@ function results({ episode, episodes, successes }) {
 
 // The page that launched the run, whose address this one has after #, goes on with what was recorded.
 function onwards({ episode }) {
-  const home = new URLSearchParams(location.hash.slice(1)).get("home");
-  if (!home || !URL.canParse(home) || new URL(home).hostname !== location.hostname) return [];
-  const { origin } = new URL(home);
+  const origin = homeOf();
+  if (!origin) return [];
   return [episode?.saved ? h("a", { class: "button", href: `${origin}/#record` }, "Judge and convert the episodes") : null,
     h("a", { class: "button", href: `${origin}/#robots` }, "Launch another run")].filter(Boolean);
+}
+
+// The page that started the run, on this machine; null if a terminal did.
+function homeOf() {
+  const home = new URLSearchParams(location.hash.slice(1)).get("home");
+  return home && URL.canParse(home) && new URL(home).hostname === location.hostname ? new URL(home).origin : null;
+}
+
+function toHome() {
+  const origin = homeOf();
+  return origin ? [h("a", { class: "button", href: `${origin}/#jobs` }, "See what became of it")] : [];
 }
 
 function showConnection() {

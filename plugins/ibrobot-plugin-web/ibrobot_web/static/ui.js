@@ -1,7 +1,7 @@
 // The page without a running robot: header, navigation, and one view at a time.
 
 import { clearToasts, h, refresh, say, switchTheme, toast } from "./dom.js";
-import { titled } from "./ui/job.js";
+import { RUNS, titled } from "./ui/job.js";
 import { words } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
@@ -41,11 +41,18 @@ class Ui extends EventTarget {
     }
   }
 
+  // Whether a run starts: it has no page yet. Another one begun meanwhile would be that of a button pressed twice.
+  get startsRun() {
+    const started = [...this.jobs.values()].some(({ kind, state, facts }) => RUNS.includes(kind) && state === "running" && !facts.url);
+    return started || (this.begun !== undefined && !this.jobs.has(this.begun));
+  }
+
   // Starts a run, and opens its page, as soon as it is ready, in a window that browsers permit only at a click.
   async openRun(start) {
     const opened = window.open("about:blank");
     const started = await this.attempt(start);
-    if (!opened) return;
+    this.begun = started?.number;
+    if (!opened) return started;
     const follow = () => {
       const job = this.jobs.get(started?.number);
       const ended = !started || (job && job.state !== "running");
@@ -57,6 +64,7 @@ class Ui extends EventTarget {
     };
     this.addEventListener("job", follow);
     follow();
+    return started;
   }
 
   // The address of a run's page, with the address of this one, to which its end leads back.
@@ -68,6 +76,7 @@ class Ui extends EventTarget {
       const again = this.connected === false;
       this.connected = true;
       this.jobs.clear();
+      this.begun = undefined;
       showConnection();
       if (again) shown?.show?.(true, address()[1]); // what was shown may have changed
     };

@@ -1,6 +1,6 @@
 // View: a command that runs as a job: its form, and what it has done.
 
-import { h, regain } from "../dom.js";
+import { h } from "../dom.js";
 import { Form } from "./form.js";
 import { JobList } from "./job.js";
 
@@ -44,12 +44,7 @@ export class View {
     localStorage.setItem(this.key, JSON.stringify(values));
     const started = await this.ui.attempt(() => this.ui.post("jobs/start", { command: this.command, values }));
     this.form.button.disabled = !this.ui.drives;
-    if (!started) { regain(this.form.button); return; }
-    setTimeout(() => { // once its card is there
-      const { element } = this.jobs.cards.get(started.number) ?? {};
-      element?.scrollIntoView({ block: "nearest" });
-      regain(element ?? this.form.button); // the next steps follow in it
-    }, 300);
+    this.jobs.reveal(started, this.form.button);
   }
 
   job(job) {

@@ -1,12 +1,13 @@
 // A card that shows a job: state, progress, output, and the button that ends it.
 
-import { h, problem, refresh, say } from "../dom.js";
+import { h, problem, refresh, regain, say } from "../dom.js";
 import { drawPlot } from "../plot.js";
 import { Question } from "./question.js";
 import { words } from "../words.js";
 
 // What a job has made -> the view that shows it.
 const MADE = { dataset: ["datasets", "Open the dataset"], policy: ["policies", "Use it in a robot"], episode: ["episodes", "See the episode"], episodes: ["episodes", "Judge the episodes"] };
+const REVEAL_MS = 300;
 export const RUNS = ["run", "record"];
 const SET_UP = "Set up"; // the group of views whose steps come first, or much later
 const STATES = { running: "running", done: "done", failed: "failed", cancelled: "ended" };
@@ -103,6 +104,7 @@ export class JobCard {
 // Why a job failed: its own error, or else its error lines, or its last lines.
 function failure(job) {
   if (job.facts.error) return [problem(job.facts.error)];
+  if (job.exit_code < 0) return [problem(`Something ended it from outside, by signal ${-job.exit_code}. Its output has its last lines.`)];
   const errors = job.lines.filter((line) => line.startsWith("error: "));
   const text = errors.length ? errors.map((line) => line.slice("error: ".length)) : job.lines.slice(-8);
   return [problem([`exit code ${job.exit_code}`, ...text].join("\n"))];
@@ -120,6 +122,15 @@ export class JobList {
 
   // Shows all jobs of the kinds.
   show() { for (const job of this.ui.jobs.values()) this.update(job); }
+
+  // Brings a job that was begun into view, with the focus, which its button lost: what comes next follows in its card.
+  reveal(started, button) {
+    setTimeout(() => { // once its card is there
+      const { element } = this.cards.get(started?.number) ?? {};
+      element?.scrollIntoView({ block: "nearest" });
+      regain(element ?? button);
+    }, REVEAL_MS);
+  }
 
   // Shows a job if it is of the kinds; returns its card then.
   update(job) {

@@ -1,6 +1,6 @@
 // View: record a number of episodes of one task.
 
-import { h, regain, say } from "../dom.js";
+import { h, say } from "../dom.js";
 import { Chooser } from "./chooser.js";
 import { Form } from "./form.js";
 import { JobList } from "./job.js";
@@ -42,7 +42,7 @@ export class View {
     if (dataset && !this.form.values.dataset) this.form.enter({ dataset });
   }
 
-  enable() { this.form.button.disabled = !this.chooser.ready || !this.ui.drives || Boolean(this.missing); }
+  enable() { this.form.button.disabled = !this.chooser.ready || !this.ui.drives || Boolean(this.missing) || this.ui.startsRun; }
 
   show(shown) {
     if (!shown) return;
@@ -72,12 +72,13 @@ export class View {
 
   async start(values) {
     this.form.button.disabled = true;
-    await this.ui.openRun(() => this.ui.post("record/start", { ...this.chooser.request, values }));
+    const started = await this.ui.openRun(() => this.ui.post("record/start", { ...this.chooser.request, values }));
     this.enable();
-    regain(this.form.button);
+    this.sessions.reveal(started, this.form.button);
   }
 
   job(job) {
+    this.enable();
     const card = this.sessions.update(job);
     if (!card || job.state === "running") return;
     this.place();

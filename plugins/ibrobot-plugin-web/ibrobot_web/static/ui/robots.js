@@ -1,6 +1,6 @@
 // View: choose a robot, see its problems, launch it, and stop it.
 
-import { h, regain } from "../dom.js";
+import { h } from "../dom.js";
 import { Chooser } from "./chooser.js";
 import { Copy } from "./copy.js";
 import { JobList, RUNS } from "./job.js";
@@ -41,7 +41,7 @@ export class View {
   enable() {
     this.copy.enable();
     this.overview.mark(this.chooser.request.robot);
-    this.launch.disabled = !this.chooser.ready || !this.ui.drives;
+    this.launch.disabled = !this.chooser.ready || !this.ui.drives || this.ui.startsRun;
     const { found } = this.chooser;
     this.hint.textContent = found?.modes && !found.modes.some(({ jogs }) => Object.keys(jogs).length)
       ? words("No mode of this YAML is driven from the robot's page. To jog from it, add `web: {type: web}` to `teleoperation`, and a mode with `teleop: web`.") : "";
@@ -49,13 +49,14 @@ export class View {
 
   async start() {
     this.launch.disabled = true;
-    await this.ui.openRun(() => this.ui.post("robots/launch", this.chooser.request));
+    const started = await this.ui.openRun(() => this.ui.post("robots/launch", this.chooser.request));
     this.enable();
-    regain(this.launch);
+    this.runs.reveal(started, this.launch);
   }
 
   job(job) {
     this.runs.update(job);
+    this.enable();
     this.overview.load();
   }
 }

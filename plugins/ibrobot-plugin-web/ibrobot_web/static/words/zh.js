@@ -395,6 +395,8 @@ export default {
   "{} robots of your own.": "你有 {} 个自己的机器人。",
   "No robot of your own yet: launch a shipped one in simulation, or copy it for your arm.": "还没有自己的机器人：在仿真中启动一个自带的，或为你的手臂复制一个。",
   "Check its devices": "检查它的设备",
+  "See what became of it": "查看它的结果",
+  "Something ended it from outside, by signal {}. Its output has its last lines.": "它被外部的信号 {} 终止。输出中有它最后的几行。",
   "Chosen below.": "已在下面选定。",
   "Datasets are made of recorded episodes.": "数据集由录制的回合制成。",
   "What is evaluated is a trained policy.": "要评测的是训练好的策略。",
