@@ -97,4 +97,3 @@ def test_focus_stays_and_cards_say_what_happened(tmp_path: Path) -> None:
         page.keyboard.press("Enter")
         reach(page, page.locator("#main").get_by_role("link", name="Check", exact=True))
         browser.close()
-

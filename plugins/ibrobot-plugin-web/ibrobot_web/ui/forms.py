@@ -36,6 +36,8 @@ _TITLES = {"eval": "Evaluate"}
 """Command -> what the page calls it, where that is not its last word."""
 _KINDS = {"episodes", "dataset", "policy", "robot"}
 """What forms offer of the opened folders."""
+_OUTCOMES = {"success": "success", "failure": "failure", "unknown": "not judged"}
+"""Outcome of an episode -> what a form calls it, in the order in which they are counted."""
 WITH_ROBOT = frozenset({"record"})
 """Commands that run a robot, with a view of their own in which it is chosen."""
 
@@ -170,7 +172,10 @@ def _known(ui: Ui, names: str) -> list[dict[str, str]]:
         for path in find_recordings(ui.folders).episodes:
             name = ui.folders.name(_dataset_of(ui, path))
             outcomes.setdefault(name, Counter())[ui.keep(Episodes).row(ui, path)["outcome"]] += 1
-        words = {name: ", ".join(f"{n} {each}" for each, n in of.most_common()) for name, of in outcomes.items()}
+        words = {
+            name: ", ".join(f"{of[each]} {words}" for each, words in _OUTCOMES.items() if of[each])
+            for name, of in outcomes.items()
+        }
         return [{"value": name, "text": f"{name}: {text}"} for name, text in words.items()]
     if names == "dataset":
         known = [ui.folders.name(path) for path in find_recordings(ui.folders).datasets]
