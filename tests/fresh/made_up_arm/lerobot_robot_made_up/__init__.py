@@ -27,11 +27,11 @@ def positions(step: int) -> dict[str, float]:
 
 @RobotConfig.register_subclass("made_up")
 @dataclass
-class MadeUpRobotConfig(RobotConfig):
+class MadeUpRobotConfig(RobotConfig):  # type: ignore[misc]  # LeRobot has no types
     """It has nothing to set."""
 
 
-class MadeUpRobot(Robot):
+class MadeUpRobot(Robot):  # type: ignore[misc]
     """An arm that goes where it is told at once."""
 
     config_class = MadeUpRobotConfig
@@ -85,11 +85,11 @@ class MadeUpRobot(Robot):
 
 @TeleoperatorConfig.register_subclass("made_up_leader")
 @dataclass
-class MadeUpLeaderConfig(TeleoperatorConfig):
+class MadeUpLeaderConfig(TeleoperatorConfig):  # type: ignore[misc]
     """It has nothing to set."""
 
 
-class MadeUpLeader(Teleoperator):
+class MadeUpLeader(Teleoperator):  # type: ignore[misc]
     """A leader that is always in motion."""
 
     config_class = MadeUpLeaderConfig
