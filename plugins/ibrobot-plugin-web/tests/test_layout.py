@@ -95,8 +95,11 @@ class Run:
         self.drive = Drive(self._carry_out, self._stop, lambda: None)
         self.refused = ""
         """Why it refuses each command; empty: it does not."""
+        self.asked = 0
+        """How many commands pages have sent."""
 
     def _carry_out(self, _: object, answer: Answer) -> None:
+        self.asked += 1
         answer({"error": self.refused} if self.refused else {"ok": None})
 
     @staticmethod
@@ -166,6 +169,7 @@ async def look() -> None:
         )
         await look_at_one_arm(page, run)
         await look_at_keys(page, run)
+        await look_at_keys_pressed_twice(page, run)
         await look_at_messages(page, run)
         await look_at_attention(page, run)
         await page.locator("#mode summary").click()
@@ -223,6 +227,21 @@ async def look_at_messages(page: Any, run: Run) -> None:
     await until(page, "!document.querySelector('[data-key=b]').disabled")
     assert await shown.all_inner_texts() == ["three", "four", "five"], "the key did nothing"
     run.refused = ""
+
+
+async def look_at_keys_pressed_twice(page: Any, run: Run) -> None:
+    """A key that is pressed twice does once what it does, and the next one does its own at once."""
+    run.refused = "counted"
+    for recording, keys, sent in ((True, "ssf", 2), (False, "bb", 1), (True, "s", 1)):
+        run.show(status(episode={**EPISODE, "recording": recording}))
+        await until(page, f"Boolean(document.querySelector('[data-key={keys[0]}]'))")
+        before = run.asked
+        for key in keys:
+            await page.keyboard.press(key)
+        await page.evaluate("ibrobot.call('/planning/go_to', {goal: 'nowhere'})")  # answered after the others
+        assert run.asked - before == sent + 1
+    run.refused = ""
+    await page.evaluate("import('/static/dom.js').then(({ clearToasts }) => clearToasts())")
 
 
 async def look_at_keys(page: Any, run: Run) -> None:

@@ -14,7 +14,7 @@ export class Record {
     this.line = h("div", { class: "line" });
     this.time = h("progress", { max: "1", value: "0", "aria-label": "Time of the episode" });
     this.cues = new Cues();
-    this.pressed = -Infinity; // when a button was pressed last [ms]
+    this.pressed = null; // the last button: its key, and when [ms]
     this.problem = h("p", { class: "bad", role: "status" });
     section.append(this.line, this.time, this.problem);
   }
@@ -46,7 +46,7 @@ export class Record {
     const { page } = this;
     if (byMode) return [h("span", { class: "note" }, "The mode begins and ends its episodes itself.")];
     const button = (text, key, service, request, kind = "", disabled = false) => h("button", {
-      class: kind, disabled: !page.operating || disabled, "data-key": key, onclick: () => this.once(() => page.call(`/record_episode/${service}`, request)),
+      class: kind, disabled: !page.operating || disabled, "data-key": key, onclick: () => this.once(key, () => page.call(`/record_episode/${service}`, request)),
     }, text, h("kbd", { "aria-hidden": "true" }, key.toUpperCase()));
     const again = (text) => redo ? [button(text, "r", "redo", null, "", stopped)] : [];
     if (waiting) return [button("Cancel", "d", "discard", null)];
@@ -66,17 +66,17 @@ export class Record {
       h("kbd", { "aria-hidden": "true" }, "B")));
     form.addEventListener("submit", (event) => {
       event.preventDefault();
-      this.once(() => page.call("/record_episode/start", { prompt: prompt.value || null, wait: true }));
+      this.once("b", () => page.call("/record_episode/start", { prompt: prompt.value || null, wait: true }));
       prompt.blur(); // so that keys judge the episode
     });
     return [form, ...again("Redo the last"), this.cues.choice];
   }
 
-  // Does what a button does, unless one was pressed just before.
-  once(act) {
+  // Does what the button with a key does, unless it was just done.
+  once(key, act) {
     const now = performance.now();
-    if (now - this.pressed < TWICE_MS) return;
-    this.pressed = now;
+    if (key === this.pressed?.key && now - this.pressed.at < TWICE_MS) return;
+    this.pressed = { key, at: now };
     act();
   }
 
