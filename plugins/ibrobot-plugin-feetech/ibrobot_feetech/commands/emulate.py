@@ -132,14 +132,14 @@ class Emulate:
 
 def _by_servo(typed: str, pairs: Sequence[tuple[int, int]]) -> dict[int, int]:
     """The values of an option by servo; raises RequestError if it names one twice."""
-    found: dict[int, int] = {}
+    values: dict[int, int] = {}
     for servo, value in pairs:
-        if servo in found:
+        if servo in values:
             raise RequestError(
-                f"{typed}: servo {servo} is given twice, with {found[servo]} and with {value}; give it once"
+                f"{typed}: servo {servo} is given twice, with {values[servo]} and with {value}; give it once"
             )
-        found[servo] = value
-    return found
+        values[servo] = value
+    return values
 
 
 def _add_mechanics(emulator: Emulator, joints: Sequence[str], cables: Mapping[int, int]) -> None:
