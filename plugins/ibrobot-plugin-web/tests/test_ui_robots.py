@@ -13,6 +13,8 @@ from ibrobot_terminal import GuideDescriptor, Question
 from ibrobot_web.ui import robots
 from ui_server import UiServer, run_ui
 
+from ibrobot_core.app import installed_plugins, shipped_configs
+
 ROBOT = """# A pan axis: it turns a camera.
 robot:
   name: pan
@@ -50,6 +52,23 @@ def test_robots_of_the_folder_are_listed_with_the_shipped_ones(folder: Path) -> 
         assert mine == {"wrong.yaml": "A pan axis", "arms/pan.yaml": "A pan axis"}
 
     run_ui([folder], test)
+
+
+def test_robots_of_a_clone_are_listed_once_and_without_those_of_its_sources(tmp_path: Path) -> None:
+    packages = tmp_path / "plugins" / "ibrobot-plugin-arm"
+    for place in ("", "tests", "plugins/ibrobot-plugin-arm", "plugins/ibrobot-plugin-arm/ibrobot_arm"):
+        (tmp_path / place).mkdir(parents=True, exist_ok=True)
+        (tmp_path / place / "pan.yaml").write_text(ROBOT)
+    for package in (tmp_path, packages):
+        (package / "pyproject.toml").touch()
+    configs = shipped_configs(installed_plugins())["so101"].parent
+
+    async def test(server: UiServer) -> None:
+        listed = await server.get("robots/list")
+        mine = [each["robot"] for each in listed if each["source"] == "folder"]
+        assert mine == ["pan.yaml", "plugins/ibrobot-plugin-arm/pan.yaml"]
+
+    run_ui([tmp_path, configs], test)
 
 
 def test_problems_are_those_of_config_check(folder: Path) -> None:

@@ -34,7 +34,7 @@ _MOST = 200
 """Robot YAMLs that are listed."""
 _HEAD = 1 << 16
 """Bytes of a file in which `robot:` is found."""
-_SKIPPED = ("episodes", "datasets", "outputs")
+_SKIPPED = ("episodes", "datasets", "outputs", "tests")
 _PAGE = re.compile(r"viewer: (?P<url>https?://\S+)(?:\s+\(to watch only: (?P<watch_url>\S+)\))?")
 RUN_DONE = (0, 3)
 """Exit codes of runs that ended as they should; 3: not all episodes or goals succeeded."""
@@ -59,10 +59,18 @@ def robot_names(ui: Ui) -> list[str]:
 
 
 def _yamls(ui: Ui) -> Iterator[Path]:
-    """The robot YAMLs of the opened folders."""
-    files = (parent / name for parent, _, names in ui.folders.walk(_DEPTH, _SKIPPED) for name in sorted(names))
-    yamls = (path for path in files if path.suffix in (".yaml", ".yml") and ui.folders.has(path))
-    return itertools.islice((path for path in yamls if _ROBOT.search(_head(path))), _MOST)
+    """The robot YAMLs of the opened folders: not those that come with ibrobot, nor those within source packages."""
+    shipped = {path.resolve() for path in shipped_configs(installed_plugins()).values()}
+    yamls = (path for path in _files(ui) if path.suffix in (".yaml", ".yml") and ui.folders.has(path))
+    own = (path for path in yamls if path.resolve() not in shipped and _ROBOT.search(_head(path)))
+    return itertools.islice(own, _MOST)
+
+
+def _files(ui: Ui) -> Iterator[Path]:
+    for parent, folders, names in ui.folders.walk(_DEPTH, _SKIPPED):
+        if "pyproject.toml" in names and parent not in ui.folders.paths:
+            folders.clear()
+        yield from (parent / name for name in sorted(names))
 
 
 def _head(path: Path) -> str:
