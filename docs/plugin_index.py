@@ -1,13 +1,18 @@
-"""The reference page that lists what each package offers, from the plugins' descriptors."""
+"""The reference page that lists what each package offers, from the plugins' descriptors.
+
+    python docs/plugin_index.py
+
+prints it as Markdown, for the packages that are installed beside this Python.
+"""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
-from importlib.metadata import entry_points, metadata, requires
+from importlib.metadata import entry_points, metadata, requires, version
 from typing import Any
 
 import pluggy
+from packaging.requirements import Requirement
 
 from ibrobot_core.plugins import installed_plugins
 
@@ -21,7 +26,7 @@ def plugin_page() -> Iterator[str]:
     shown = sorted((packages.get(name, CORE), name) for name in managers)
     shown.sort(key=lambda pair: pair[0] != CORE)
     yield "# Plugins\n"
-    yield "This page lists what core and the plugins of the repository offer. Each type links to its"
+    yield "This page lists what core and the plugins that are installed with it offer. Each type links to its"
     yield "options. `ibrobot plugins` prints the list for your own installation.\n"
     yield from _needs(sorted({package for package, _ in shown if package != CORE}))
     for package, name in shown:
@@ -35,14 +40,15 @@ def plugin_page() -> Iterator[str]:
 
 
 def _needs(plugins: list[str]) -> Iterator[str]:
-    """A table of what the packages need of the project, from their metadata."""
-    yield "All packages need `ibrobot-core`; these need more of the project:\n"
-    yield "| package | needs |"
-    yield "|---|---|"
+    """A table of the packages: which core they permit, and what else they need of the project, from their metadata."""
+    yield "| package | version | works with | needs |"
+    yield "|---|---|---|---|"
     for plugin in plugins:
-        needed = {re.split(r"[^\w-]", each)[0] for each in requires(plugin) or () if "extra ==" not in each}
-        if libraries := sorted(name for name in needed - {CORE, plugin} if name.startswith("ibrobot-")):
-            yield f"| `{plugin}` | {', '.join(f'`{name}`' for name in libraries)} |"
+        needed = [Requirement(each) for each in requires(plugin) or () if "extra ==" not in each]
+        core = ", ".join(f"`{each.name}{each.specifier}`" for each in needed if each.name == CORE)
+        names = {each.name for each in needed} - {CORE, plugin}
+        libraries = ", ".join(f"`{name}`" for name in sorted(names) if name.startswith("ibrobot-"))
+        yield f"| `{plugin}` | {version(plugin)} | {core} | {libraries} |"
     yield ""
 
 
@@ -65,3 +71,7 @@ def _offers(manager: pluggy.PluginManager) -> Iterator[tuple[str, str, str]]:
 
 def _yielded(manager: pluggy.PluginManager, hook: str) -> list[Any]:
     return [item for result in getattr(manager.hook, hook)() for item in result]
+
+
+if __name__ == "__main__":
+    print("\n".join(plugin_page()))

@@ -38,6 +38,14 @@ pytest_add_cli_args_test_selection = ["tests"]
 timeout_constant = 20.0
 use_git_change_detection = false
 """
+_IMPATIENT = """
+def pytest_collection_modifyitems(items):
+    for item in items:
+        for name in ("wait_s", "patience_s"):
+            if hasattr(item.cls, name):
+                setattr(item.cls, name, 5.0)
+"""
+"""What is right answers within a fraction of that, and every mutant that never answers takes as long."""
 
 
 def prepare(folder: Path, kind: str) -> Path:
@@ -52,6 +60,7 @@ def prepare(folder: Path, kind: str) -> Path:
     settings = package / "pyproject.toml"
     text = settings.read_text(encoding="utf-8") + _CONFIG.format(module=module.name, kind=kind)
     settings.write_text(text, encoding="utf-8")
+    (package / "conftest.py").write_text(_IMPATIENT, encoding="utf-8")
     return package
 
 

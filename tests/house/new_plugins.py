@@ -1,4 +1,4 @@
-"""Each kind of `ibrobot plugins new`, as an author meets it: an empty environment, wheels, tests, lint, types, a run.
+"""Each kind of `ibrobot plugins new`, as an author meets it: from an empty environment to its own wheel.
 
     python tests/house/new_plugins.py WHEELS FOLDER [KIND …]
 
@@ -20,7 +20,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 OFFICIAL = ROOT / "ibrobot_core/official_plugins.json"
-STEPS = ("generate", "install", "tests", "lint", "types", "run")
+STEPS = ("generate", "install", "tests", "lint", "types", "run", "wheel")
 
 
 def sample_packages() -> dict[str, list[str]]:
@@ -71,6 +71,11 @@ class Authors:
         first = robot.read_text(encoding="utf-8").partition("\n")[0]
         command = shlex.split(re.findall(r": ibrobot (.*)$", first)[0])
         yield "run", [[f"{own}/ibrobot", *command]], package
+        # As docs/how-to/publish-a-plugin.md says: the wheel alone, without what its tests need.
+        built = ["uv", "build", "--quiet", "--wheel", "--clear"]
+        wheel = f"{package}/dist/{package.name.replace('-', '_')}-0.1.0-py3-none-any.whl"
+        installed = self._install(self._environment, wheel, "ibrobot-testing")
+        yield "wheel", [built, installed, [f"{own}/ibrobot", "plugins", "check", package.name]], package
 
     def measure(self, kind: str) -> tuple[dict[str, float], int]:
         """The seconds of each step, up to the one that fails; and the lines of the package."""

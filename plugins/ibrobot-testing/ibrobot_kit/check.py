@@ -136,11 +136,20 @@ def _described(name: str, descriptor: Descriptor[Any]) -> Iterator[Check]:
         try:
             made: Any = late.load()
         except Exception as error:  # noqa: BLE001 - whatever the plugin raises
-            yield Check(name, False, f"{late.place} cannot be imported: {error}", "name what is there")
+            text = f"{late.place} cannot be imported: {error}"
+            yield Check(name, False, text, _remedy(error, late.place.partition(".")[0]))
             continue
         lacking = sorted(made.__abstractmethods__) if inspect.isabstract(made) else []
         text = f"{made.__name__} lacks {', '.join(lacking)}" if lacking else f"{late.place} is there"
         yield Check(name, not lacking, text, "define these methods")
+
+
+def _remedy(error: Exception, own: str) -> str:
+    """What an author does about a place in the module `own` that cannot be imported."""
+    lacking = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else own
+    return (
+        "name what is there" if lacking == own else f"add what has {lacking} to the dependencies of its pyproject.toml"
+    )
 
 
 def _places(make: Any) -> list[Late]:

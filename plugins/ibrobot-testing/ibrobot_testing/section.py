@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import SimpleNamespace
+from types import SimpleNamespace, UnionType
 from typing import Any, cast
 
 import numpy as np
@@ -51,10 +51,20 @@ class SectionSuite(Suite[Component]):
             component.stop()
 
     def test_says_what_it_is(self) -> None:
-        """`name` and `summary` are text, for the plan that `--dry-run` prints."""
-        component = self.component(self.session())
-        assert component.name, "name is empty"
-        assert component.summary, "summary is empty"
+        """`name` and `summary` are text, for the plan that `--dry-run` prints; services say what they do."""
+        with self.started() as (component, session):
+            for told in ("name", "summary"):
+                text = getattr(component, told)
+                assert isinstance(text, str), f"{told} is {text!r}"
+                assert text, f"{told} is empty"
+            assert isinstance(component.needs, tuple), f"needs is {component.needs!r}: write a tuple of names"
+            others = self.session().bus.services()
+            for name, service in session.bus.services().items():
+                if name in others:
+                    continue
+                assert name.startswith("/"), f"the service {name!r}: its name must begin with /"
+                assert service.help, f"the service {name} has no help"
+                assert isinstance(service.answer, type | UnionType), f"the service {name} says no type of its answer"
 
     def test_steps_without_and_with_messages(self) -> None:
         """A tick of lockstep does not need messages, and takes joint states."""

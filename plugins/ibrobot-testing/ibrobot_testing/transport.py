@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import gc
+import logging
 import queue
 import threading
+import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from typing import ClassVar
+from typing import ClassVar, Self, override
 
 import pytest
 
@@ -16,6 +19,32 @@ from ibrobot_testing.suite import Suite, wait_until
 
 _HELD_S = 120.0
 """Maximum time for which a callback is blocked [s]; longer than all waits, so that no callback continues by itself."""
+
+
+class _Log(logging.Handler):
+    """All log records of this process, while it is open."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._records: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
+        self._texts: list[str] = []
+
+    @override
+    def emit(self, record: logging.LogRecord) -> None:
+        self._records.put(record)
+
+    def text(self) -> str:
+        """What was logged, with tracebacks."""
+        while not self._records.empty():
+            self._texts.append(logging.Formatter().format(self._records.get()))
+        return "\n".join(self._texts)
+
+    def __enter__(self) -> Self:
+        logging.getLogger().addHandler(self)
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        logging.getLogger().removeHandler(self)
 
 
 class TransportSuite(Suite[Transport]):
@@ -33,6 +62,10 @@ class TransportSuite(Suite[Transport]):
 
     def settle(self, near: Transport, far: Transport) -> None:
         """Wait until each end knows the subscriptions and services of the other."""
+
+    def kill(self, far: Transport, name: str) -> None:
+        """End the server of `name` as the death of its process does. Override it to have this checked."""
+        pytest.skip("override kill to have the death of a server checked")
 
     @contextmanager
     def ends(self) -> Iterator[tuple[Transport, Transport]]:
@@ -91,12 +124,60 @@ class TransportSuite(Suite[Transport]):
             with pytest.raises(queue.Empty):
                 ended.get(timeout=self.short_s)
 
-    def test_a_slow_subscriber_blocks_nobody(self) -> None:
-        """`publish` returns and others are served while one callback blocks."""
+    def test_an_ended_subscription_drops_what_waits(self) -> None:
+        """What waited behind a callback when its subscription ended is not delivered."""
         with self.ends() as (near, far), ThreadPoolExecutor() as pool, self.held() as release:
-            arrived: queue.SimpleQueue[Payload] = queue.SimpleQueue()
+            ended: queue.SimpleQueue[Payload] = queue.SimpleQueue()
+            going: queue.SimpleQueue[Payload] = queue.SimpleQueue()
 
             def slow(payload: Payload) -> None:
+                ended.put(payload)
+                release.wait(_HELD_S)
+
+            end = far.subscribe("topic", slow)
+            far.subscribe("topic", going.put)
+            self.settle(near, far)
+            pool.submit(lambda: [near.publish("topic", payload) for payload in (b"1", b"2")])
+            assert [going.get(timeout=self.wait_s) for _ in range(2)] == [b"1", b"2"]
+            assert ended.get(timeout=self.wait_s) == b"1"
+            ending = pool.submit(end)
+            wait([ending], self.short_s)
+            release.set()
+            ending.result(self.wait_s)
+            with pytest.raises(queue.Empty):
+                ended.get(timeout=self.short_s)
+
+    def test_callbacks_may_end_themselves(self) -> None:
+        """A callback may end its own subscription or watch, and a server its own service."""
+        with self.ends() as (near, far):
+            ends: dict[str, Callable[[], None]] = {}
+            ended: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+            def end(name: str) -> None:
+                ends[name]()
+                ended.put(name)
+
+            ends["subscription"] = far.subscribe("topic", lambda payload: end("subscription"))
+            ends["watch"] = near.watch("echo", lambda served: end("watch") if served else None)
+
+            def answer(payload: Payload, _: str | None) -> Payload:
+                end("service")
+                return payload
+
+            ends["service"] = far.serve("echo", answer)
+            self.settle(near, far)
+            near.publish("topic", b"x")
+            assert near.request("echo", b"x", self.wait_s) == b"x"
+            assert {ended.get(timeout=self.wait_s) for _ in ends} == set(ends)
+
+    def test_a_slow_subscriber_blocks_nobody(self) -> None:
+        """`publish` returns and others are served while one callback blocks; it is not called again meanwhile."""
+        with self.ends() as (near, far), ThreadPoolExecutor() as pool, self.held() as release:
+            arrived: queue.SimpleQueue[Payload] = queue.SimpleQueue()
+            begun: queue.SimpleQueue[Payload] = queue.SimpleQueue()
+
+            def slow(payload: Payload) -> None:
+                begun.put(payload)
                 release.wait(_HELD_S)
 
             far.subscribe("topic", slow)
@@ -107,10 +188,13 @@ class TransportSuite(Suite[Transport]):
             assert done, "publish waits for a slow subscriber"
             for _ in range(3):
                 assert arrived.get(timeout=self.wait_s / 2) == b"x"
+            assert begun.get(timeout=self.wait_s / 2) == b"x"
+            with pytest.raises(queue.Empty):
+                begun.get(timeout=self.short_s)
 
     def test_a_failing_subscriber_harms_nobody(self) -> None:
-        """An exception in a callback does not affect the publisher or other subscribers; it is called again."""
-        with self.ends() as (near, far):
+        """An exception in a callback is logged, and affects neither publisher nor others; it is called again."""
+        with self.ends() as (near, far), _Log() as log:
             calls: queue.SimpleQueue[Payload] = queue.SimpleQueue()
             arrived: queue.SimpleQueue[Payload] = queue.SimpleQueue()
 
@@ -125,6 +209,7 @@ class TransportSuite(Suite[Transport]):
                 near.publish("topic", payload)
                 assert arrived.get(timeout=self.wait_s) == payload
                 assert calls.get(timeout=self.wait_s) == payload
+            wait_until(lambda: "the callback failed" in log.text(), self.wait_s)
 
     def test_each_request_gets_its_own_answer(self) -> None:
         """Concurrent requests each get their own answer."""
@@ -235,6 +320,52 @@ class TransportSuite(Suite[Transport]):
             with pytest.raises(TransportError):
                 near.request("echo", b"x", self.short_s)
 
+    def test_an_ended_server_begins_no_request(self) -> None:
+        """Requests that still wait for a worker when their server ends fail, and are not begun."""
+        with self.ends() as (near, far), ThreadPoolExecutor() as pool, self.held() as release:
+            begun: queue.SimpleQueue[Payload] = queue.SimpleQueue()
+
+            def answer(payload: Payload, _: str | None) -> Payload:
+                begun.put(payload)
+                release.wait(_HELD_S)
+                return payload
+
+            end = far.serve("echo", answer, workers=1)
+            self.settle(near, far)
+            pool.submit(near.request, "echo", b"first", self.wait_s)
+            assert begun.get(timeout=self.wait_s) == b"first"
+            second = pool.submit(near.request, "echo", b"second", self.wait_s)
+            wait([second], self.short_s)
+            wait([pool.submit(end)], self.short_s)
+            release.set()
+            with pytest.raises(TransportError):
+                second.result(self.wait_s)
+            assert begun.empty()
+
+    def test_the_death_of_a_server_ends_what_waits_for_it(self) -> None:
+        """When a server dies, a pending request is a TransportError at once, and watches report it."""
+        with self.ends() as (near, far), ThreadPoolExecutor() as pool, self.held() as release:
+            begun = threading.Event()
+
+            def answer(payload: Payload, _: str | None) -> Payload:
+                begun.set()
+                release.wait(_HELD_S)
+                return payload
+
+            far.serve("echo", answer)
+            self.settle(near, far)
+            told: queue.SimpleQueue[bool] = queue.SimpleQueue()
+            near.watch("echo", told.put)
+            assert told.get_nowait() is True
+            asked = pool.submit(near.request, "echo", b"x", _HELD_S)
+            assert begun.wait(self.wait_s)
+            self.kill(far, "echo")
+            with pytest.raises(TransportError):
+                asked.result(self.wait_s)
+            assert told.get(timeout=self.wait_s) is False
+            with pytest.raises(TransportError):
+                near.request("echo", b"x", self.short_s)
+
     def test_a_name_is_served_once(self) -> None:
         """A second server of a name is refused until the first has ended."""
         with self.ends() as (near, far):
@@ -300,11 +431,40 @@ class TransportSuite(Suite[Transport]):
             assert near.request("echo", b"x", self.wait_s) == b"x"
             assert arrived.get(timeout=self.wait_s) == b"x"
 
-    def test_a_closed_transport_refuses(self) -> None:
-        """After `close`, which is safe twice, every call is a TransportError."""
+    def test_ended_callbacks_do_not_accumulate(self) -> None:
+        """Callbacks of ended subscriptions and watches are not kept; Zenoh keeps the last one of a topic."""
+
+        class Callback:
+            def __call__(self, _: object) -> None:
+                pass
+
         with self.ends() as (near, _):
+            for begin in (near.subscribe, near.watch):
+                kept: list[weakref.ref[Callback]] = []
+                for _ in range(3):
+                    callback = Callback()
+                    kept.append(weakref.ref(callback))
+                    begin("name", callback)()
+                    del callback
+
+                def kept_at_most_one(kept: list[weakref.ref[Callback]] = kept) -> bool:
+                    gc.collect()
+                    return sum(each() is not None for each in kept) <= 1
+
+                wait_until(kept_at_most_one, self.wait_s)
+
+    def test_a_closed_transport_refuses(self) -> None:
+        """After `close`, which is safe twice, every call is a TransportError; what it ended can be ended again."""
+        with self.ends() as (near, _):
+            ends = (
+                near.subscribe("topic", lambda payload: None),
+                near.watch("name", lambda served: None),
+                near.serve("name", lambda payload, _: payload),
+            )
             near.close()
             near.close()
+            for end in ends:
+                end()
             calls: tuple[Callable[[], object], ...] = (
                 lambda: near.publish("topic", b""),
                 lambda: near.subscribe("topic", lambda payload: None),

@@ -82,6 +82,7 @@ def test_good_package_fails_nothing_and_says_what_was_not_run(site: Site, capsys
         (':FakeTeleop")', ':Nobody")', "teleop wave",
          "ibrobot_testing.fakes.host:Nobody cannot be imported: module 'ibrobot_testing.fakes.host' has no attribute"),
         (':FakeTeleop")', ':Nobody")', "teleop wave", "; name what is there"),
+        ("ibrobot_testing.fakes.host:", "fake_wave.none:", "teleop wave", "; name what is there"),
         ("ibrobot_testing.fakes.host:FakeTeleop", "ibrobot_core.api:Teleop", "teleop wave",
          "Teleop lacks connect, disconnect, read; define these methods"),
         ('"waves"', '""', "teleop wave", "it has no summary; lists of plugins show it"),
@@ -97,6 +98,14 @@ def test_mistake_fails_with_its_cause(site: Site, old: str, new: str, name: str,
     wrong = [check for check in failed.value.result if check.matters and not check.ok]
     assert [check.name for check in wrong] == [name]
     assert message in f"{wrong[0].found}; {wrong[0].remedy}"
+
+
+def test_missing_dependency_of_an_implementation_is_named(site: Site) -> None:
+    install(site, PLUGIN.replace("ibrobot_testing.fakes.host:", "fake_stick:"))
+    (site.folder / "fake_stick.py").write_text("import no_such_library.sticks\n")
+    wrong = [check for check in examine("fake-wave", installed_plugins()) if check.name == "teleop wave"][-1]
+    assert wrong.found == "fake_stick:FakeTeleop cannot be imported: No module named 'no_such_library'"
+    assert (wrong.ok, wrong.remedy) == (False, "add what has no_such_library to the dependencies of its pyproject.toml")
 
 
 @pytest.mark.parametrize(

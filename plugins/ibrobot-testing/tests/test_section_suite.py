@@ -50,6 +50,43 @@ class Nameless(Counter):
         self.name = ""
 
 
+class NoSummary(Counter):
+    def __init__(self, session):
+        super().__init__(session)
+        self.summary = None
+
+
+class NeedsOneWord(Counter):
+    """As if a comma was forgotten: `("control")`."""
+
+    def __init__(self, session):
+        super().__init__(session)
+        self.needs = CONTROL
+
+
+class ServesUnexplained(Counter):
+    """Offers another service than the one it resets by."""
+
+    service = Service("/restart_count", NoRequest, str)
+
+    def setup(self):
+        super().setup()
+        self.session.bus.serve(self.service, self.reset)
+        self.on_end.callback(self.session.bus.unserve, self.service)
+
+    def teardown(self):
+        super().teardown()
+        self.on_end.close()
+
+
+class ServesANameWithoutSlash(ServesUnexplained):
+    service = Service("restart_count", NoRequest, str, "Count from 0 again.")
+
+
+class ServesUntyped(ServesUnexplained):
+    service = Service("/restart_count", NoRequest, None, "Count from 0 again.")
+
+
 class NeedsMessages(Counter):
     def work(self, timeout_s):
         received = self.states.get(timeout_s)
@@ -69,6 +106,11 @@ class ListensForEver(Counter):
 
 WRONG = {
     Nameless: "says_what_it_is",
+    NoSummary: "says_what_it_is",
+    NeedsOneWord: "says_what_it_is",
+    ServesUnexplained: "says_what_it_is",
+    ServesANameWithoutSlash: "says_what_it_is",
+    ServesUntyped: "says_what_it_is",
     NeedsMessages: "steps_without_and_with_messages",
     ServesForEver: "start_and_stop_are_safe_at_any_time",
     ListensForEver: "leaves_the_bus_when_stopped",

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import queue
 import threading
+from contextlib import suppress
 from typing import Any, override
 
 import pytest
 from ibrobot_testing import TransportSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakeTransport
 
-from ibrobot_core.api import Payload, TransportError
+from ibrobot_core.api import TransportError
 
 
 class TestTransport(TransportSuite):
@@ -18,10 +19,15 @@ class TestTransport(TransportSuite):
     def make(self, ctx):
         return FakeTransport()
 
+    @override
+    def kill(self, far, name):
+        far.kill(name)
 
-class ShortSuite(TransportSuite):
+
+class ShortSuite(TestTransport):
     """Waits less long for what the wrong ones never send."""
 
+    __test__ = False
     wait_s = 0.2
 
 
@@ -63,6 +69,46 @@ class NeverEnds(FakeTransport):
         if len(known) == 1:
             super().subscribe(topic, lambda payload: [call(payload) for call in known])
         return lambda: None
+
+
+class DeliversWhatWaits(FakeTransport):
+    """Goes on with what has arrived, after the end of a subscription."""
+
+    def subscribe(self, topic, callback):
+        end = super().subscribe(topic, callback)
+        listener = self._subscribers[topic][-1]
+        shut = listener._pool.shutdown
+        listener._pool.shutdown = lambda **_: shut(wait=False)
+        return end
+
+
+class WaitsForItsCallback(FakeTransport):
+    """The end of a subscription waits for the callback, even from within."""
+
+    def subscribe(self, topic, callback):
+        end = super().subscribe(topic, callback)
+        listener = self._subscribers[topic][-1]
+        shut = listener._pool.shutdown
+        listener._pool.shutdown = lambda **_: shut(wait=True, cancel_futures=True)
+        return end
+
+
+class TwoThreads(FakeTransport):
+    """Two payloads at once."""
+
+    def subscribe(self, topic, callback):
+        end = super().subscribe(topic, callback)
+        self._subscribers[topic][-1]._pool._max_workers = 2
+        return end
+
+
+class FailsInSilence(FakeTransport):
+    def subscribe(self, topic, callback):
+        def silent(payload):
+            with suppress(Exception):
+                callback(payload)
+
+        return super().subscribe(topic, silent)
 
 
 class CallsInTheSendersThread(FakeTransport):
@@ -192,6 +238,51 @@ class ListsTheEnded(FakeTransport):
         return frozenset(name for name in self.known if name.startswith(prefix))
 
 
+class AnswersWhoWaits(FakeTransport):
+    """Goes on with the requests that it has, after the end of their server."""
+
+    def serve(self, name, handler, *, workers=16):
+        end = super().serve(name, handler, workers=workers)
+        shut = self._servers[name].threads.shutdown
+        self._servers[name].threads.shutdown = lambda **_: shut(wait=False)
+        return end
+
+
+class WaitsForTheDead(FakeTransport):
+    """Nobody learns that a server has died."""
+
+    def kill(self, *names):
+        pass
+
+
+class RemembersWatches(FakeTransport):
+    def __init__(self):
+        super().__init__()
+        self.known = []
+
+    def watch(self, name, changed):
+        self.known.append(changed)
+        return super().watch(name, changed)
+
+
+class RemembersSubscriptions(FakeTransport):
+    def __init__(self):
+        super().__init__()
+        self.known = []
+
+    def subscribe(self, topic, callback):
+        self.known.append(callback)
+        return super().subscribe(topic, callback)
+
+
+class EndsOnlyWhatIsOpen(FakeTransport):
+    def _leave(self, of, key, listener):
+        with self._lock:
+            if listener in of[key]:
+                of[key].remove(listener)
+        listener.end()
+
+
 class WorksWhileClosed(FakeTransport):
     def _check_open(self):
         pass
@@ -202,6 +293,10 @@ WRONG = {
     Reorders: "delivers_in_order",
     OneTopic: "every_subscriber_gets_its_topic_only",
     NeverEnds: "an_ended_subscription_is_silent",
+    DeliversWhatWaits: "an_ended_subscription_drops_what_waits",
+    WaitsForItsCallback: "callbacks_may_end_themselves",
+    TwoThreads: "a_slow_subscriber_blocks_nobody",
+    FailsInSilence: "a_failing_subscriber_harms_nobody",
     CallsInTheSendersThread: "a_slow_subscriber_blocks_nobody",
     DropsFailingSubscribers: "a_failing_subscriber_harms_nobody",
     MixesAnswers: "each_request_gets_its_own_answer",
@@ -214,6 +309,11 @@ WRONG = {
     EmptyForNobody: "nobody_serves",
     LastServerWins: "a_name_is_served_once",
     OneCallAtATime: "a_server_may_use_the_transport",
+    AnswersWhoWaits: "an_ended_server_begins_no_request",
+    WaitsForTheDead: "the_death_of_a_server_ends_what_waits_for_it",
+    RemembersWatches: "ended_callbacks_do_not_accumulate",
+    RemembersSubscriptions: "ended_callbacks_do_not_accumulate",
+    EndsOnlyWhatIsOpen: "a_closed_transport_refuses",
     WorksWhileClosed: "a_closed_transport_refuses",
 }
 
@@ -231,39 +331,3 @@ def test_catches(wrong, caught_by, tmp_path):
 
 def test_every_check_catches_something():
     assert checks(TransportSuite) == set(WRONG.values())
-
-
-def test_a_failing_subscriber_is_logged(caplog: pytest.LogCaptureFixture) -> None:
-    transport = FakeTransport()
-    taken: queue.SimpleQueue[Payload] = queue.SimpleQueue()
-
-    def failing(payload: Payload) -> None:
-        if payload == b"bad":
-            raise ValueError("cannot read this")
-        taken.put(payload)
-
-    transport.subscribe("topic", failing)
-    for payload in (b"bad", b"good"):
-        transport.publish("topic", payload)
-    assert taken.get(timeout=30) == b"good"
-    transport.close()
-    assert "a subscriber of topic failed" in caplog.text
-    assert "cannot read this" in caplog.text
-
-
-def test_a_subscriber_may_end_itself() -> None:
-    transport = FakeTransport()
-    arrived: list[Payload] = []
-    done = threading.Event()
-
-    def once(payload: Payload) -> None:
-        arrived.append(payload)
-        end()
-        done.set()
-
-    end = transport.subscribe("topic", once)
-    transport.publish("topic", b"1")
-    transport.publish("topic", b"2")
-    assert done.wait(30)
-    transport.close()
-    assert arrived == [b"1"]

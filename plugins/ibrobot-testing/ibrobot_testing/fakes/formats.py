@@ -84,11 +84,14 @@ class FakeUnits(PolicyVectors):
 
     @override
     def __call__(self, values: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        return {key: np.degrees(value) if key == "observation.state" else value for key, value in values.items()}
+        joints = ("action", "observation.state")
+        return {key: np.degrees(value) if key in joints else value for key, value in values.items()}
 
     @override
     def frame(self, frame: Frame) -> Frame:
-        return attrs.evolve(frame, values=self(frame.values))
+        prefix = None if frame.prefix is None else np.degrees(frame.prefix)
+        history = tuple(self.frame(each) for each in frame.history)
+        return attrs.evolve(frame, values=self(frame.values), prefix=prefix, history=history)
 
     @override
     def radians(self, key: str, value: NDArray[Any]) -> NDArray[Any]:

@@ -18,11 +18,11 @@ from ibrobot_core.app import (
     ControlMode,
     LaunchRequest,
     LogFormatter,
-    ModeOptions,
     NoRequest,
     RequestError,
     RunDisplay,
     RunHooks,
+    RunOptions,
     RunTerminal,
     Runtime,
     RunView,
@@ -51,7 +51,7 @@ class FakeSection(SessionWorker):
 
     @override
     def setup(self) -> None:
-        self._states = self.session.bus.subscribe("/joint_states", 1)
+        self._states = self.session.bus.subscribe("/joint_states")
         self.on_end.callback(self._states.close)
         self.session.bus.serve(self._service, self._reset)
         self.on_end.callback(self.session.bus.unserve, self._service)
@@ -134,7 +134,7 @@ class FakeCommand:
 
 
 @attrs.frozen(kw_only=True)
-class FakeSourceCommand(ModeOptions):
+class FakeSourceCommand(RunOptions):
     """Move the first joint of a robot to and fro."""
 
     times: int = option(1, gt=0, help="how often")
@@ -142,8 +142,7 @@ class FakeSourceCommand(ModeOptions):
     def __call__(self) -> None:
         """Run the robot."""
         request = LaunchRequest(self.lockstep, source=lambda session, mode: FakeSway(session, mode, self.times))
-        robot = self.load(self.mode)
-        run_robot(robot, request, headless=self.headless, dry_run=self.dry_run, as_json=self.as_json)
+        run_robot(self.load(), request, headless=self.headless, as_json=self.as_json)
 
 
 class FakeSway(SourceWorker):

@@ -36,8 +36,7 @@ class _Listener[T]:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix=name)
 
     def put(self, item: T) -> None:
-        with suppress(RuntimeError):  # it has ended
-            self._pool.submit(self._call, item)
+        self._pool.submit(self._call, item)
 
     def end(self) -> None:
         """Stop processing."""
@@ -106,11 +105,11 @@ class FakeTransport(Transport):
             if server is None:
                 raise TransportError(f"nobody serves {name}")
             answer = server.threads.submit(server.handler, bytes(payload), None)
+        # `wait` does not notice by itself that a request was cancelled.
+        answer.add_done_callback(lambda done: done.cancelled() and done.set_running_or_notify_cancel())
         wait((answer, server.died), timeout_s, FIRST_COMPLETED)
-        if (server.died.done() and not answer.done()) or answer.cancelled():
-            raise TransportError(f"nobody serves {name}, or not any more")
         if not answer.done():
-            raise TransportError(f"no answer from {name} within {timeout_s} s")
+            raise TransportError(f"no answer from {name} within {timeout_s} s, or its server has ended")
         try:
             return answer.result()
         except Exception as error:
