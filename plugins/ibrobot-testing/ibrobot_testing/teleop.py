@@ -205,13 +205,13 @@ class TeleopSuite(Suite[Teleop]):
             self._needs_a_new_press(teleop, ctx, pose)
 
     def test_each_press_is_one_event(self) -> None:
-        """Each press of a button gives its event once, even while the deadman is released."""
+        """Each press of a button gives its event once, even while the deadman is released, and none before."""
         if not self.events:
             pytest.skip("has no buttons")
         with self.connected() as (teleop, ctx):
             pose = self.poses(ctx)[0]
             begin_operation(teleop, self._measure(ctx, pose))
-            operate(teleop, self._measure(ctx, pose))
+            assert list(operate(teleop, self._measure(ctx, pose)).events) == [], "an event before any button"
             for event in (*self.events, *self.events):
                 self.press(teleop, event)
                 events = [each for _ in range(3) for each in operate(teleop, self._measure(ctx, pose)).events]
@@ -249,7 +249,10 @@ class TeleopSuite(Suite[Teleop]):
             assert isinstance(self._begin(teleop, ctx, self.poses(ctx)[0]), TeleopCommand)
 
     def test_refuses_reading_while_disconnected(self) -> None:
-        """`read` raises TeleopError after `disconnect`."""
+        """`read` raises TeleopError before `connect`, and after `disconnect`."""
+        ctx = self.context()
+        with pytest.raises(TeleopError):
+            operate(self.make(ctx), self._measure(ctx, self.poses(ctx)[0]))
         with self.connected() as (teleop, ctx):
             pass
         with pytest.raises(TeleopError):

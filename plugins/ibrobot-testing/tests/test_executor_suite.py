@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import override
 
+import attrs
 import numpy as np
 import pytest
 from ibrobot_testing import ExecutorSuite, checks, failed_checks
@@ -177,6 +178,29 @@ class CancelsNothing(FakeExecutor):
         self._statuses.append(GoalStatus("", GoalState.CANCELED))
 
 
+class ReportsNoGoal(FakeExecutor):
+    def pop_status(self):
+        status = super().pop_status()
+        if status is not None and status.state is GoalState.EXECUTING:
+            return attrs.evolve(status, goal_id="")
+        return status
+
+
+class JumpsBack(FakeExecutor):
+    """Limits its speed in one direction alone."""
+
+    def update(self, measured):
+        before = self._setpoint
+        if self._goal_id is not None and (self._goal < before).any():
+            self._setpoint = self._goal
+        return super().update(measured)
+
+
+class CountsFromOne(FakeExecutor):
+    def counters(self):
+        return {"refused_plans": super().counters()["refused_plans"] + 1}
+
+
 WRONG = {
     OtherJoints: "owns_the_joints_it_was_given",
     HoldsZero: "activation_holds_the_measured_position",
@@ -195,6 +219,9 @@ WRONG = {
     NeverReports: "reaches_its_goal",
     DropsTheOldGoal: "a_rejected_goal_leaves_the_old_one",
     AcceptsAnything: "a_rejected_goal_leaves_the_old_one",
+    ReportsNoGoal: "reaches_its_goal",
+    JumpsBack: "replacing_a_goal_makes_no_step",
+    CountsFromOne: "refuses_an_impossible_plan",
     JumpsToANewGoal: "replacing_a_goal_makes_no_step",
     CancelGoesOn: "cancel_holds_the_measured_position",
     CancelsNothing: "cancel_without_a_goal_does_nothing_bad",

@@ -155,6 +155,25 @@ class ReadsWhileDisconnected(FakeTeleop):
         return super().read(measured)
 
 
+class OpenFromTheBeginning(FakeTeleop):
+    def __init__(self, ctx):
+        super().__init__(ctx)
+        self._open = True
+
+
+class PressesAButtonByItself(FakeTeleop):
+    """Reports a button as soon as it is activated."""
+
+    def activate(self, measured):
+        super().activate(measured)
+        self.own = 2
+
+    def read(self, measured):
+        command = super().read(measured)
+        self.own -= 1
+        return attrs.evolve(command, events=("intervention",)) if self.own == 0 else command
+
+
 WRONG = {
     BeginsAtZero: "begins_where_the_robot_is",
     BeginsWhereItFirstBegan: "begins_where_the_robot_is",
@@ -171,6 +190,8 @@ WRONG = {
     StaysPressed: "each_press_is_one_event",
     NeverArrives: "approach_arrives",
     DisconnectsOnce: "disconnect_is_safe_at_any_time",
+    OpenFromTheBeginning: "refuses_reading_while_disconnected",
+    PressesAButtonByItself: "each_press_is_one_event",
     ReadsWhileDisconnected: "refuses_reading_while_disconnected",
 }
 
