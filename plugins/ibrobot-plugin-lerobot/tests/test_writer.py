@@ -38,6 +38,11 @@ class TestLeRobotDatasetWriter(DatasetSuite):
         saved = sorted(p for p in (root / ".episodes").glob("*") if not p.suffix)
         return [frames for path in (saved or [root]) for frames in tables(path)]
 
+    @override
+    def read_tasks(self, root: Path) -> Sequence[Sequence[str]]:
+        names = {row["task_index"]: row["task"] for row in pq.read_table(root / "meta/tasks.parquet").to_pylist()}
+        return [[names[int(index)] for index in episode["task_index"]] for episode in self.read_back(root)]
+
 
 def tables(root: Path) -> list[dict[str, NDArray[Any]]]:
     """The episodes of a dataset: column -> rows."""

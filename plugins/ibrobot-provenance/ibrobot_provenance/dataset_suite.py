@@ -31,6 +31,10 @@ class DatasetSuite(Suite[DatasetWriter]):
         """The saved episodes in order, as key -> frames stacked along the first axis; also before `finalize`."""
         raise NotImplementedError(f"{type(self).__name__} must define read_back(self, root)")
 
+    def read_tasks(self, root: Path) -> Sequence[Sequence[str]]:
+        """The tasks of the saved episodes' frames, in order. Override it to have them checked."""
+        pytest.skip("override read_tasks to have tasks checked")
+
     def created(self, root: Path) -> DatasetWriter:
         """A new dataset in `root`."""
         writer = self.make(self.context())
@@ -55,13 +59,24 @@ class DatasetSuite(Suite[DatasetWriter]):
                 np.testing.assert_array_equal(values[key], wanted, err_msg=key)
 
     def test_gives_back_what_was_written(self, tmp_path: Path) -> None:
-        """Episodes are numbered from 0, and every value is reproduced bit by bit."""
-        writer = self.created(tmp_path / "set")
+        """Episodes are numbered from 0, and every value is reproduced bit by bit; the folder may be a new one's."""
+        root = tmp_path / "new" / "set"
+        writer = self.created(root)
         for episode, numbers in enumerate(((0, 1, 2), (3, 4))):
             self._add(writer, *numbers)
             assert writer.save_episode() == episode
         writer.finalize()
-        self._check(tmp_path / "set", [(0, 1, 2), (3, 4)])
+        self._check(root, [(0, 1, 2), (3, 4)])
+
+    def test_keeps_the_tasks(self, tmp_path: Path) -> None:
+        """Each frame keeps its task."""
+        writer = self.created(tmp_path / "set")
+        for tasks in (("pick", "pick"), ("place",)):
+            for i, task in enumerate(tasks):
+                writer.add_frame(self.frame(i), task)
+            writer.save_episode()
+        writer.finalize()
+        assert [list(each) for each in self.read_tasks(tmp_path / "set")] == [["pick", "pick"], ["place"]]
 
     def test_never_writes_over_anything(self, tmp_path: Path) -> None:
         """A non-empty root is refused and not changed; an empty one is accepted."""

@@ -22,6 +22,27 @@ class TestDataset(DatasetSuite):
     def read_back(self, root):
         return [dict(np.load(path)) for path in sorted(root.glob("episode_*.npz"))]
 
+    @override
+    def read_tasks(self, root):
+        return [values["task"].tolist() for values in self.read_back(root)]
+
+
+class OneTaskForAll(FakeDataset):
+    """Gives all frames the task of the first one."""
+
+    first = ""
+
+    def add_frame(self, values, task):
+        self.first = self.first or task
+        super().add_frame(values, self.first)
+
+
+class NeedsTheFolderAbove(FakeDataset):
+    def create(self, root, fps, features, metadata):
+        if not root.parent.is_dir():
+            raise DatasetError(f"{root.parent} does not exist")
+        super().create(root, fps, features, metadata)
+
 
 class HalfPrecision(FakeDataset):
     def add_frame(self, values, task):
@@ -99,6 +120,8 @@ class IgnoresFramesBeforeCreate(FakeDataset):
 
 
 WRONG = {
+    OneTaskForAll: "keeps_the_tasks",
+    NeedsTheFolderAbove: "gives_back_what_was_written",
     HalfPrecision: "gives_back_what_was_written",
     CountsFromOne: "gives_back_what_was_written",
     WritesOver: "never_writes_over_anything",

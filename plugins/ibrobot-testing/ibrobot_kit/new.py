@@ -174,8 +174,7 @@ def render(kind: str, name: str, *, outside: bool = True) -> dict[str, str]:
     checked = f"class Test{title}({suite[2]}):\n{facts['attributes']}{facts['make']}{facts['methods']}"
     shown = (facts["helpers"], checked if suite[2] else "", facts["tests"])
     facts["tests"] = "\n\n\n".join(each.strip("\n") for each in shown if each.strip())
-    # As the formatter has it: two empty lines only above functions and classes.
-    facts["gap"] = "\n" * (1 + facts["tests"].startswith(("def ", "class ", "@")))
+    facts["gap"], facts["body_gap"] = (_gap(facts[each]) for each in ("tests", "body"))
     files = {
         "pyproject.toml": "pyproject.toml", "README.md": "README.md", "module.py": f"{own}/__init__.py",
         "implementation.py": f"{own}/{kind}.py", "test.py": f"tests/test_{name}.py", "robot.yaml": facts["robot_file"],
@@ -236,6 +235,11 @@ def _parts(templates: Iterable[Any], facts: Mapping[str, Any], *names: str) -> d
     modules = [template.make_module(dict(facts)) for template in templates]
     named = {each: getattr(module, each) for module in modules for each in vars(module) if not each.startswith("_")}
     return {each: str(part() if callable(part) else part) for each, part in named.items() if each in (names or named)}
+
+
+def _gap(text: str) -> str:
+    """What the formatter has between imports and a text: two empty lines only above functions and classes."""
+    return "\n" * (1 + text.startswith(("def ", "class ", "@")))
 
 
 def _lines(text: str) -> list[str]:

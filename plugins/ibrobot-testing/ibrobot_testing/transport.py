@@ -321,7 +321,7 @@ class TransportSuite(Suite[Transport]):
                 near.request("echo", b"x", self.short_s)
 
     def test_an_ended_server_begins_no_request(self) -> None:
-        """Requests that still wait for a worker when their server ends fail, and are not begun."""
+        """Requests that still wait for a worker when their server ends fail at once, and are not begun."""
         with self.ends() as (near, far), ThreadPoolExecutor() as pool, self.held() as release:
             begun: queue.SimpleQueue[Payload] = queue.SimpleQueue()
 
@@ -334,7 +334,7 @@ class TransportSuite(Suite[Transport]):
             self.settle(near, far)
             pool.submit(near.request, "echo", b"first", self.wait_s)
             assert begun.get(timeout=self.wait_s) == b"first"
-            second = pool.submit(near.request, "echo", b"second", self.wait_s)
+            second = pool.submit(near.request, "echo", b"second", _HELD_S)
             wait([second], self.short_s)
             wait([pool.submit(end)], self.short_s)
             release.set()

@@ -44,7 +44,7 @@ class FakeRecorder(Recorder):
         episode.directory.mkdir()
         self._file = (episode.directory / "records.jsonl").open("w")
         self._episode = episode
-        self._write_metadata({"outcome": "unfinished"})
+        _write_metadata(episode, {"outcome": "unfinished"})
 
     @override
     def write(self, topic: str, message: Message, received_ns: int) -> None:
@@ -58,13 +58,12 @@ class FakeRecorder(Recorder):
     def end(self, episode: EpisodeEnd) -> Path | None:
         start = self._open()
         self._file.close()
-        if episode.outcome != "discarded":
-            faults = {"faults": list(episode.faults)} if episode.faults else {}
-            self._write_metadata({"outcome": episode.outcome, "dropped": dict(episode.dropped), **faults})
         self._episode = None
         if episode.outcome == "discarded":
             shutil.rmtree(start.directory)
             return None
+        faults = {"faults": list(episode.faults)} if episode.faults else {}
+        _write_metadata(start, {"outcome": episode.outcome, "dropped": dict(episode.dropped), **faults})
         return start.directory
 
     @override
@@ -77,9 +76,9 @@ class FakeRecorder(Recorder):
             raise RecorderError("no episode has begun")
         return self._episode
 
-    def _write_metadata(self, closing: Mapping[str, Any]) -> None:
-        start = self._open()
-        (start.directory / "metadata.json").write_text(json.dumps({**start.metadata, **closing}))
+
+def _write_metadata(start: EpisodeStart, closing: Mapping[str, Any]) -> None:
+    (start.directory / "metadata.json").write_text(json.dumps({**start.metadata, **closing}))
 
 
 def _plain(value: Any) -> Any:
