@@ -603,6 +603,19 @@ class TestBuildingBesideTheLoop:
         self.settle(loop, gate)
         assert loop.go(ACROSS)[0] > 0
 
+    def test_the_loop_takes_over_what_the_thread_made_as_it_is_and_without_a_lock(self, tmp_path, gate) -> None:
+        """Objects, shapes and pairs are made in the thread; the loop changes a reference to them."""
+        loop = Loop(tmp_path, LEFT, clock=RealClock())
+        building, before = loop.guard._building, loop.guard._pairs
+        loop.world(WALL)
+        self.settle(loop, gate)
+        made = building.finished[0].pairs
+        building._lock = None  # type: ignore[assignment]  # whoever takes it fails
+        loop.tick(LEFT)
+        assert loop.guard._pairs is made
+        assert list(building.old) == [before], "and leaves it to the thread to free them"
+        assert not loop.safety.guard_fault
+
     def test_a_flood_of_changes_makes_one_world(self, tmp_path, gate) -> None:
         loop = Loop(tmp_path, LEFT, clock=RealClock())
         for number in range(300):
