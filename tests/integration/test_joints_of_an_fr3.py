@@ -130,4 +130,11 @@ def test_another_unit_is_named(arm: Path, data: Reference, unit: str) -> None:
 def test_an_arm_as_it_should_be_is_accused_of_neither(arm: Path, data: Reference) -> None:
     for seed in (40, 41):
         named = {each.name for each in diagnose(read_episode(recorded(arm, seed)), data).findings}
-        assert not named & {"joint_order", "other_units", "joint_zero", "gripper_scaled", "gripper_reversed"}
+        assert not named & {
+            "joint_order",
+            "other_units",
+            "joint_zero",
+            "gripper_scaled",
+            "gripper_reversed",
+            "saturated",
+        }

@@ -81,9 +81,13 @@ def read_contents(out: Path) -> Sequence[ReportSection]:
     Raises:
         DatasetError: if it is damaged.
     """
-    return read_sections(
-        out / REPORT, "an explanation", lambda facts: contents_of(facts, facts["plots"], Path(facts["path"]))
-    )
+
+    def contents(facts: dict[str, Any]) -> Sequence[ReportSection]:
+        pictures = Text(f"{out / 'report.html'} shows what the cameras saw, with the pictures of each finding.")
+        sections = contents_of(facts, facts["plots"], Path(facts["path"]))
+        return [*sections, ReportSection("Pictures", (pictures,))]
+
+    return read_sections(out / REPORT, "an explanation", contents)
 
 
 def read_facts(file: Path) -> dict[str, Any]:
@@ -117,7 +121,9 @@ def read_sections(
     facts = read_facts(file)
     try:
         return contents(facts)
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+    except KeyError as error:
+        raise DatasetError(f"{file}: is not {what} of this version: it has no {error}; make it again") from None
+    except (IndexError, TypeError, ValueError, AttributeError) as error:
         raise DatasetError(f"{file}: is not {what}: {error!r}") from None
 
 

@@ -195,6 +195,8 @@ class Window:
     """Whether states and commands are rows of a dataset, one at each tick."""
     rig: Rig | None = None
     """The rig at rest that it shows; None for a run or a demonstration."""
+    teaches: bool = False
+    """Whether it is an episode of a dataset: a demonstration also if a policy acted."""
 
     @property
     def start_ns(self) -> int:
@@ -218,7 +220,8 @@ class Window:
             "answers": bool(self.asked), "chunks": any(each.used for each in self.asked),
             "pictures": any(each.pictures for each in self.cameras.values()),
             "guard": bool((self.document.get("control") or {}).get("guard")),
-            "outcome": self.outcome in ("success", "failure"), "demonstration": not self.asked and self.rig is None,
+            "outcome": self.outcome in ("success", "failure"),
+            "demonstration": self.rig is None and (self.teaches or not self.asked),
             "motion": self.rig is None, "rig": self.rig is not None,
         }  # fmt: skip
         return frozenset(name for name, there in has.items() if there)

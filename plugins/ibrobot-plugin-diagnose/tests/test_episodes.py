@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
+from pathlib import Path
 
+import numpy as np
 import pytest
 from ibrobot_diagnose.card import Maker, make_card
 from ibrobot_diagnose.cause import Reference
+from ibrobot_diagnose.commands import check
 from ibrobot_diagnose.diagnosis import diagnose
+from ibrobot_diagnose.testing import make_window
 from made_runs import Run, window_of
 from planted_faults import DEMONSTRATED
 
@@ -63,3 +68,27 @@ def test_run_beside_the_starts_of_a_few_demonstrations_is_named():
 def test_task_is_usual_where_each_episode_has_its_own():
     reference = Reference(make_card(demo(seed=seed, prompt=f"sort shelf {seed}") for seed in range(4)))
     assert diagnose(demo(seed=70, prompt="sort shelf 9"), reference).first == ""
+
+
+@pytest.mark.parametrize(
+    ("cause", "options"), [("idle_start", {"idle_s": 3.0, "seconds": 9.5}), ("idle_end", {"seconds": 12.0})]
+)
+def test_episode_of_a_dataset_in_which_a_policy_acted_is_a_demonstration(cause, options, others, monkeypatch):
+    run = window_of(Run(seed=50, cameras=(), **options))
+    assert run.asked
+    monkeypatch.setattr(check, "read_episode", lambda path: run)
+    named = [each["name"] for each in check.check_episode((Path("episode"), others.card)).causes]
+    assert named[0] == cause
+    assert cause not in {each.name for each in diagnose(run, others).findings}, "a run that is explained is none"
+
+
+@pytest.mark.parametrize("lasts_s", [0.3, 1.0, 2.0])
+@pytest.mark.parametrize("bound", [9.0, 0.6])
+def test_joint_that_stands_while_others_move_is_cut_off_only_if_they_go_on(lasts_s, bound):
+    """A planned motion stops at each of its goals, and leaves a joint where a goal does not name it."""
+    goals = [(0.0, 0.0), (0.8, 0.5), (0.8, -0.5), (0.8, 0.2), (0.0, 0.0)]
+    ramp = 0.5 - 0.5 * np.cos(np.pi * np.arange(round(30 * lasts_s)) / round(30 * lasts_s))
+    parts = [np.outer(1 - ramp, one) + np.outer(ramp, other) for one, other in itertools.pairwise(goals)]
+    commands = np.minimum(np.concatenate(parts), (bound, 9.0))
+    accused = "saturated" in {each.name for each in diagnose(make_window(commands), Reference()).findings}
+    assert accused == (bound < 1)

@@ -31,10 +31,10 @@ svg .bad-fill { fill: var(--bad); } svg .range { stroke: var(--ok); stroke-width
 svg .faint { fill: var(--ok); fill-opacity: .45; } svg .band { fill: var(--band); }
 svg .estimate { stroke: var(--ok); stroke-width: 2; fill: none; } svg .zero { stroke: var(--fg); }
 svg .margin { stroke: var(--muted); stroke-dasharray: 4 4; }
-.panels { display: grid; grid-template-columns: repeat(auto-fill, minmax(320px, 1fr)); gap: 1rem; }
+.panels { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(320px, 100%), 1fr)); gap: 1rem; }
 .failure { background: var(--card); border-radius: 8px; padding: .8rem; min-width: 0; }
 .failure h3 { margin: 0 0 .4rem; font-size: 1rem; } video { width: 100%; border-radius: 4px; background: #000; }
-code { font: 12.5px/1.4 ui-monospace, monospace; } code, p, a, .text { overflow-wrap: anywhere; }
+code { font: 12.5px/1.4 ui-monospace, monospace; } h1, h2, h3, code, p, a, .text { overflow-wrap: anywhere; }
 a { color: var(--ok); } p { max-width: 75ch; }
 """
 

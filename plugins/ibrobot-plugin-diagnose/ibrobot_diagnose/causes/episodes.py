@@ -5,12 +5,17 @@ from __future__ import annotations
 from typing import ClassVar, override
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ibrobot_diagnose.card import Card, jerk_of, rests_of, series_of, way_of
 from ibrobot_diagnose.cause import CardCause, Cause, Evidence, Reference, likelihood
-from ibrobot_diagnose.window import Window
+from ibrobot_diagnose.window import Floats, Window
 
 _SHOWN = frozenset({"demonstration", "state"})
+_SLOW = 0.003
+"""Motion from one time to the next that is none, beside the noise of readings [rad]."""
+_GOES_ON = 0.2
+"""Share of its largest speed with which a joint goes on moving; scripted motions have at most 0.04 where they stop."""
 
 
 class _Still(CardCause):
@@ -40,6 +45,7 @@ class IdleStart(_Still):
         "idle_start_s",
         "at the beginning",
     )
+    explains = frozenset({"stands_still"})
     mends = "trim start"
     remedy = "Cut it: `ibrobot episodes trim EPISODE --from SECONDS`; a policy learns to wait from it."
 
@@ -66,7 +72,7 @@ class Jerk(CardCause):
 
     name, title = "jerk", "the motion is as smooth as in the other episodes"
     needs = _SHOWN | {"card"}
-    explains = frozenset({"other_speed", "odd_path"})
+    explains = frozenset({"other_speed", "odd_path", "answers_tremble"})
     remedy = "Drop the episode; look for a leader that sticks, a device with gaps, or a control rate that is too low."
 
     @override
@@ -92,13 +98,13 @@ class Saturated(Cause):
         values = values[np.isfinite(values).all(axis=1)]
         if len(values) < 10:
             return None
-        moving = np.abs(np.diff(values, axis=0)).max(axis=1, initial=0.0) > 0.002
-        span = np.ptp(values, axis=0)
+        steps = np.abs(np.diff(values, axis=0))
+        moving = steps.max(axis=1, initial=0.0) > 0.002
         shares = np.zeros(len(window.joints))
-        for extreme in (values.min(axis=0), values.max(axis=0)):
-            cut = np.abs(values[1:] - extreme) < 1e-4
-            shares = np.maximum(shares, (cut & moving[:, None]).sum(axis=0) / max(1, int(moving.sum())))
-        shares[span < 0.1] = 0.0
+        for joint in np.flatnonzero(np.ptp(values, axis=0) >= 0.1):
+            for extreme in (values[:, joint].min(), values[:, joint].max()):
+                cut = _cut_off(np.abs(values[:, joint] - extreme) < 1e-4, np.delete(steps, joint, axis=1))
+                shares[joint] = max(shares[joint], (cut[1:] & moving).sum() / max(1, int(moving.sum())))
         # A gripper that is shut stands at its end, too.
         shares = np.array(
             [0.0 if "grip" in joint else share for joint, share in zip(window.joints, shares, strict=True)]
@@ -109,6 +115,21 @@ class Saturated(Cause):
             "off."
         )
         return Evidence(text, 100 * float(shares[j]), "%", 12.0, likelihood(float(shares[j]), 0.12, 0.3))
+
+
+def _cut_off(still: NDArray[np.bool_], others: Floats) -> NDArray[np.bool_]:
+    """Where a joint is cut off among the times at which it stands at its end, shape (T,).
+
+    There the other joints go on moving, by `others` from each time to the next, when it stops or moves on. A joint that
+    a motion leaves where it is stops and moves on where all others do: at the ends of a part of the motion.
+    """
+    pace = (others / np.maximum(others.max(axis=0, initial=0.0), _SLOW)).max(axis=1, initial=0.0)
+    edges = np.flatnonzero(np.diff(still.astype(int), prepend=0, append=0))
+    cut = np.zeros_like(still)
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        near = (pace[max(0, at - 3) : at + 2].min() for at in (begin, end) if 0 < at < len(still))
+        cut[begin:end] = any(least > _GOES_ON for least in near)
+    return cut
 
 
 class PictureBlack(Cause):

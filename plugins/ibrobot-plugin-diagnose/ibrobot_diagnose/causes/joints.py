@@ -21,7 +21,7 @@ _REPEATS = 0.6
 """Usual distance up to which pictures of a camera repeat, so that they say something of the pose."""
 _CONSEQUENCES = frozenset({
     "unseen_start", "unseen_states", "other_speed", "statistics", "limits_low", "stands_still", "arm_not_following",
-    "saturated", "odd_length", "odd_path", "idle_start", "idle_end",
+    "guard_held", "saturated", "odd_length", "odd_path", "idle_start", "idle_end",
 })  # fmt: skip
 """Causes that an arm seems to have if its readings are not what they are taken for."""
 

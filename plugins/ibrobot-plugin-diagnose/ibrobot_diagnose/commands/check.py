@@ -149,7 +149,7 @@ def check_episode(order: tuple[Path, Card], progress: Callable[[int], None] = la
         RecorderError: if it cannot be read.
     """
     episode, card = order
-    window = read_episode(episode)
+    window = attrs.evolve(read_episode(episode), teaches=True)
     if "state" not in window.streams:
         raise RecorderError(
             f"{episode}: nothing can be checked: it has {len(window.state.times_ns)} readings of joints"
