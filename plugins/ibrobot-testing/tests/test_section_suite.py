@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import override
+from typing import Any, override
 
 import pytest
 from ibrobot_testing import SectionSuite, checks, failed_checks
@@ -53,7 +53,7 @@ class Nameless(Counter):
 class NoSummary(Counter):
     def __init__(self, session):
         super().__init__(session)
-        self.summary = None
+        vars(self)["summary"] = None
 
 
 class NeedsOneWord(Counter):
@@ -61,7 +61,7 @@ class NeedsOneWord(Counter):
 
     def __init__(self, session):
         super().__init__(session)
-        self.needs = CONTROL
+        vars(self)["needs"] = CONTROL
 
 
 class ServesUnexplained(Counter):
@@ -84,7 +84,8 @@ class ServesANameWithoutSlash(ServesUnexplained):
 
 
 class ServesUntyped(ServesUnexplained):
-    service = Service("/restart_count", NoRequest, None, "Count from 0 again.")
+    nothing: Any = None
+    service = Service("/restart_count", NoRequest, nothing, "Count from 0 again.")
 
 
 class NeedsMessages(Counter):

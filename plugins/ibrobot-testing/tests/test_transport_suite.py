@@ -78,7 +78,7 @@ class DeliversWhatWaits(FakeTransport):
         end = super().subscribe(topic, callback)
         listener = self._subscribers[topic][-1]
         shut = listener._pool.shutdown
-        listener._pool.shutdown = lambda **_: shut(wait=False)
+        vars(listener._pool)["shutdown"] = lambda **_: shut(wait=False)
         return end
 
 
@@ -89,7 +89,7 @@ class WaitsForItsCallback(FakeTransport):
         end = super().subscribe(topic, callback)
         listener = self._subscribers[topic][-1]
         shut = listener._pool.shutdown
-        listener._pool.shutdown = lambda **_: shut(wait=True, cancel_futures=True)
+        vars(listener._pool)["shutdown"] = lambda **_: shut(wait=True, cancel_futures=True)
         return end
 
 
@@ -244,7 +244,7 @@ class AnswersWhoWaits(FakeTransport):
     def serve(self, name, handler, *, workers=16):
         end = super().serve(name, handler, workers=workers)
         shut = self._servers[name].threads.shutdown
-        self._servers[name].threads.shutdown = lambda **_: shut(wait=False)
+        vars(self._servers[name].threads)["shutdown"] = lambda **_: shut(wait=False)
         return end
 
 
