@@ -147,13 +147,13 @@ class Mjcf:
                 name, leader = (model.joint(joint).name for joint in (int(model.eq_obj1id[row]), second))
                 coupled[name] = Follower(leader, float(curve[1]), float(curve[0]))
         leaders = {name: Follower(name, 1.0, 0.0) for name in joints}
-        found: dict[str, Follower] = {}
+        followers: dict[str, Follower] = {}
         while new := {n: each for n, each in coupled.items() if each.leader in leaders and n not in leaders}:
             for name, each in new.items():
                 of = leaders[each.leader]
-                found[name] = Follower(of.leader, each.factor * of.factor, each.offset + each.factor * of.offset)
-            leaders |= found
-        return found
+                followers[name] = Follower(of.leader, each.factor * of.factor, each.offset + each.factor * of.offset)
+            leaders |= followers
+        return followers
 
     def chain(
         self, tip: str, joints: Sequence[str], *, lower: Vector | None = None, upper: Vector | None = None
