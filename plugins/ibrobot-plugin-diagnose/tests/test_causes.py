@@ -80,6 +80,14 @@ def test_a_guard_that_held_nothing_back_is_healthy():
     assert "guard_held" in {name for name, _ in diagnose(window, Reference()).healthy}
 
 
+@pytest.mark.parametrize("cause", ["statistics", "other_units", "joint_order", "gripper_reversed"])
+def test_a_guard_that_held_an_arm_back_which_is_misled_comes_after_what_misleads_it(cause, data):
+    run = Run(seed=9203, outcome="failure", guarded=(0.1, 0.9), **NONE, **JOINTS[cause][2])
+    named = [each.name for each in diagnose(window_of(run), data).findings]
+    assert named[0] == cause
+    assert "guard_held" in named
+
+
 @pytest.mark.parametrize("label", ["no JSON", "[]", "{}", "3", '{"first": 1}'])
 def test_a_label_of_another_guard_is_shown_as_it_is(label):
     window = window_of(Run(seed=9200, cameras=(), guarded=(0.2, 0.8)))

@@ -177,7 +177,7 @@ class Statistics(CardCause):
     needs = frozenset({"chunks", "state", "card"})
     explains = frozenset({
         "unseen_states", "limits_low", "arm_not_following", "other_speed", "joint_zero", "gripper_scaled",
-        "smoothing_averages",
+        "smoothing_averages", "guard_held",
     })  # fmt: skip
     remedy = (
         "Use the statistics that lie beside the checkpoint: a model that is normalised with the ones of another "
