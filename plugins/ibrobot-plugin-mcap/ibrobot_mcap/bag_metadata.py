@@ -14,6 +14,8 @@ from ibrobot_mcap.metadata import INFORMATION, METADATA, quoted, write_metadata
 
 _PER_TOPIC = "topics_with_message_count"
 _PLAIN = (str, int, float)
+_LARGEST = 16 * 1024 * 1024
+"""Largest `metadata.yaml` that is read [bytes]; those of recordings have some KB."""
 
 
 @attrs.frozen
@@ -39,10 +41,16 @@ def read_bag_info(path: Path) -> BagInfo | None:
     Raises:
         RecorderError: if it cannot be read.
     """
-    try:
-        return parse_bag_info(path.read_text(encoding="utf-8"), path)
-    except FileNotFoundError:
+    if not path.exists():
         return None
+    if not path.is_file():  # a device has no end, and a pipe none that comes
+        raise RecorderError(f"{path}: is no file")
+    try:
+        with path.open("rb") as file:
+            content = file.read(_LARGEST + 1)
+        if len(content) > _LARGEST:
+            raise RecorderError(f"{path}: is larger than {_LARGEST >> 20} MiB, which no metadata of a bag is")
+        return parse_bag_info(content.decode(), path)
     except (OSError, UnicodeDecodeError) as error:
         raise RecorderError(f"{path}: cannot be read: {error}") from error
 

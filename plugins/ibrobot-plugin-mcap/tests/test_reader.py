@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
 import struct
@@ -145,6 +146,27 @@ def test_other_folders_and_files_are_refused_as_bags(tmp_path, name, content, re
 def test_metadata_that_is_none_is_refused(tmp_path, text):
     (tmp_path / "metadata.yaml").write_text(text)
     with pytest.raises(RecorderError, match=r"metadata.yaml: is not metadata of a rosbag2"):
+        Rosbag2Reader(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [
+        ("/dev/zero", "is no file"),
+        ("pipe", "is no file"),
+        ("huge", "is larger than 16 MiB, which no metadata of a bag is"),
+    ],
+)
+def test_metadata_that_would_fill_the_memory_is_not_read(tmp_path, kind, why):
+    path = tmp_path / "metadata.yaml"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "huge":
+        with path.open("wb") as file:
+            file.truncate(1 << 40)
+    else:
+        path.symlink_to(kind)
+    with pytest.raises(RecorderError, match=f"metadata.yaml: {why}"):
         Rosbag2Reader(tmp_path)
 
 

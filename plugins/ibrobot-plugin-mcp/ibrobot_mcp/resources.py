@@ -14,7 +14,7 @@ from ibrobot_provenance.reports import ReportDescriptor, kinds_of_reports
 
 from ibrobot_core.api import IbrobotError, seconds
 from ibrobot_core.app import RequestError, RunView, dump_yaml, installed_plugins
-from ibrobot_mcp.work import Places, report_lines
+from ibrobot_mcp.work import Places, report_lines, unreadable
 
 _MOST = 500
 """Most episodes in the list, the newest ones."""
@@ -134,7 +134,8 @@ class Resources:
         rows: list[Mapping[str, Any]] = []
         for folder, kind in self._kept():
             try:
-                facts: Mapping[str, Any] = {"lines": list(kind.lines(folder))}
+                why = unreadable(folder)
+                facts: Mapping[str, Any] = {"unreadable": why} if why else {"lines": list(kind.lines(folder))}
             except (IbrobotError, OSError) as error:
                 facts = {"unreadable": str(error)}
             rows.append({"name": folder.name, "kind": kind.type, "path": str(folder), **facts})

@@ -37,6 +37,8 @@ from ibrobot_mcp.options import SECTION
 
 _MOST_RESULTS = 1000
 """Most folders of results of each kind."""
+_LARGEST = 32 * 1024 * 1024
+"""Largest file of results that is read [bytes]."""
 _LINES = 20
 """Last lines of output that a failure shows."""
 _IDLE = (
@@ -108,7 +110,7 @@ class Places:
         """
         open_to_all = [*self.kept(), *([] if self.root is None else [self.root])]
         for top in self._tops:
-            with suppress(OSError):  # a name that is too long
+            with suppress(OSError, RuntimeError):  # a name that is too long, or links in a circle
                 path = find_episode(top / text).resolve()
                 there = path.exists() or path.with_name(path.name.rpartition(":")[0] or path.name).exists()
                 if there and any(path.is_relative_to(each) for each in open_to_all):
@@ -273,11 +275,21 @@ def _found(job: Job) -> WorkResult:
     return WorkResult(True, (text,), folder, tuple(report))
 
 
+def unreadable(folder: Path) -> str:
+    """Why a folder of results is not read: it may come from elsewhere, and what fills the memory ends the run."""
+    for each in sorted(folder.glob("*.json*")):
+        if not each.is_file() or each.stat().st_size > _LARGEST:
+            return f"{each}: is no file of at most {_LARGEST >> 20} MiB"
+    return ""
+
+
 def report_lines(kind: str, folder: Path) -> list[str]:
     """A report on a folder, as text."""
     descriptor = kinds_of_reports().get(kind)
     if descriptor is None:
         return []
+    if why := unreadable(folder):
+        return [why]
     try:
         return [line for section in descriptor.make(folder) for line in _of_section(section)]
     except IbrobotError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -198,6 +199,7 @@ def places_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Places:
         (folder / name).mkdir(parents=True, exist_ok=True)
     (folder / "private" / "key").write_text("secret")
     (folder / "episodes" / "out").symlink_to(folder / "private")
+    (folder / "episodes" / "round").symlink_to("round")
     monkeypatch.setattr(work, "kinds_of_work", lambda: [(SimpleNamespace(keeps="evaluations"), "")])
     recording = SimpleNamespace(root=str(folder / "episodes"), dataset="pick")
     return Places(cast("RunView", SimpleNamespace(config=SimpleNamespace(recording=recording))))
@@ -222,7 +224,7 @@ def test_recordings_are_named_in_several_ways(tmp_path: Path, monkeypatch: pytes
     [
         "/", "~", "private", "../private", "../private/key", "out", "out/key", "episodes/out/key", "/etc/passwd",
         "evaluations/../private", "pick/../../private", "pick/episodes/../../out/key", "x" * 900, "a/" * 400,
-        "nothing:1", "private:1", "/proc/self/environ", "$HOME", "evaluations/b",
+        "nothing:1", "private:1", "/proc/self/environ", "$HOME", "evaluations/b", "round", "round/pick", "round:1",
     ],
 )  # fmt: skip
 def test_other_files_are_out_of_reach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
@@ -268,3 +270,19 @@ def test_a_report_that_cannot_be_read_says_so(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(work, "kinds_of_reports", lambda: {"looks": attrs.evolve(REPORT, make=broken)})
     assert report_lines("looks", Path("x")) == ["report.json is damaged"]
     assert report_lines("unknown", Path("x")) == []
+
+
+@pytest.mark.parametrize("kind", ["device", "pipe", "huge"])
+def test_results_that_would_fill_the_memory_are_not_read(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(work, "kinds_of_reports", lambda: {"looks": REPORT})
+    path = tmp_path / "evaluation.json"
+    if kind == "device":
+        path.symlink_to("/dev/zero")
+    elif kind == "pipe":
+        os.mkfifo(path)
+    else:
+        with path.open("wb") as file:
+            file.truncate(1 << 40)
+    assert report_lines("looks", tmp_path) == [f"{path}: is no file of at most 32 MiB"]
