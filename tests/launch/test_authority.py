@@ -8,11 +8,14 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
+import pytest
 from ibrobot_testing import make_session, stand_in
 
+from ibrobot_core.clock import RealClock
 from ibrobot_core.control.commands import CancelGoals, LimitSpeed
 from ibrobot_core.launch.authority import Authority, Grant
 from ibrobot_core.launch.session import Session
+from ibrobot_core.units import ns
 
 GRANT = Grant(60.0, ("/test/move",), speed=0.2)
 
@@ -89,3 +92,20 @@ def test_end_of_an_authority_does_not_lift_the_speed_limit_of_the_next_one() -> 
     assert speeds[-1] == GRANT.speed
     authority.close()
     assert speeds[-1] == 1.0
+
+
+def test_grant_lasts_as_long_as_it_says_whatever_the_time_of_day(monkeypatch: pytest.MonkeyPatch) -> None:
+    passed_s, day_s = [100], [1_800_000_000]
+    times = {"monotonic_ns": lambda: ns(passed_s[0]), "time_ns": lambda: ns(day_s[0])}
+    monkeypatch.setattr("ibrobot_core.clock.time", SimpleNamespace(**times))
+    session, authority = armed(lambda command: None, lambda plan: None)
+    session.clock = RealClock()
+    authority.arm(GRANT)
+    for later_s, shift_s, is_armed in [(30, -86_400, True), (29, 10 * 86_400, True), (2, -10 * 86_400, False)]:
+        passed_s[0] += later_s
+        day_s[0] += shift_s
+        authority.renew(authority._agents[0])
+        authority.check()
+        assert bool(authority.status().armed) is is_armed
+    assert authority.status().ended == "its time is over"
+    authority.close()
