@@ -341,7 +341,7 @@ def test_agent_of_the_how_to_picks_up_the_cube(tmp_path: Path) -> None:
     assert agent.stdout is not None
     with agent:
         assert "ask a person" in agent.stdout.readline()
-        grant = [program, "agent", "arm", "--seconds", "120", "--speed", "0.5"]
+        grant = [str(program), "agent", "arm", "--seconds", "120", "--speed", "0.5"]
         granted = subprocess.run(grant, input="y\n", capture_output=True, text=True, check=True)
         assert "it asks for: /task/run" in granted.stdout
         said = [line for line in agent.stdout.read().splitlines() if not line.startswith("refused:")]

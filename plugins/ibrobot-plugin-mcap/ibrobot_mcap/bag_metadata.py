@@ -44,7 +44,7 @@ def read_bag_info(path: Path) -> BagInfo | None:
     if not path.exists():
         return None
     if not path.is_file():  # a device has no end, and a pipe none that comes
-        raise RecorderError(f"{path}: is no file")
+        raise RecorderError(f"{path}: is not a file")
     try:
         with path.open("rb") as file:
             content = file.read(_LARGEST + 1)

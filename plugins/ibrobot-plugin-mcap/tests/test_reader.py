@@ -152,8 +152,8 @@ def test_metadata_that_is_none_is_refused(tmp_path, text):
 @pytest.mark.parametrize(
     ("kind", "why"),
     [
-        ("/dev/zero", "is no file"),
-        ("pipe", "is no file"),
+        ("/dev/zero", "is not a file"),
+        ("pipe", "is not a file"),
         ("huge", "is larger than 16 MiB, which no metadata of a bag is"),
     ],
 )

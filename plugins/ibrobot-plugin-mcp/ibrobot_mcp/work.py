@@ -279,7 +279,7 @@ def unreadable(folder: Path) -> str:
     """Why a folder of results is not read: it may come from elsewhere, and what fills the memory ends the run."""
     for each in sorted(folder.glob("*.json*")):
         if not each.is_file() or each.stat().st_size > _LARGEST:
-            return f"{each}: is no file of at most {_LARGEST >> 20} MiB"
+            return f"{each}: is not a file of at most {_LARGEST >> 20} MiB"
     return ""
 
 

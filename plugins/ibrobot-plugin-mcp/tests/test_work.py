@@ -285,4 +285,4 @@ def test_results_that_would_fill_the_memory_are_not_read(
     else:
         with path.open("wb") as file:
             file.truncate(1 << 40)
-    assert report_lines("looks", tmp_path) == [f"{path}: is no file of at most 32 MiB"]
+    assert report_lines("looks", tmp_path) == [f"{path}: is not a file of at most 32 MiB"]
