@@ -230,7 +230,7 @@ class Model:
         if first.missing:
             yield f"the recording lacks {', '.join(sorted(first.missing))} at {at_s:.2f} s"
         if len(differing) == count and first.difference < 1e-3:
-            yield "rounding: another processor, or another number of threads (`threads` of the model)"
+            yield "rounding: another processor, other versions of libraries, or another number of threads (`threads`)"
         yield (
             "an observation: model, library and processor are the same, so the recording has another picture or state "
             f"at {at_s:.2f} s than the model was given"
@@ -349,9 +349,9 @@ def effects(model: Model) -> list[Effect]:
     listed = []
     for numbers, (what, how, change) in changes:
         try:
-            moved = [
-                np.abs(model.answer(_changed(frames[i], i, change), prompt) - plain[i]).mean(axis=0) for i in numbers
-            ]
+            with np.errstate(invalid="raise"):  # as 0 / 0 in the rotation of a quaternion of zeros
+                answers = {i: model.answer(_changed(frames[i], i, change), prompt) for i in numbers}
+            moved = [np.abs(answer - plain[i]).mean(axis=0) for i, answer in answers.items()]
         except Exception as error:  # noqa: BLE001 - what cannot be, e.g. a rotation of zeros, may raise anything
             _log.info("the model gives no answer with %s %s: %s", what, how, error)
             continue

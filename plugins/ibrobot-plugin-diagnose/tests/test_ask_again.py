@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from importlib.util import find_spec
 
 import pytest
 from command_line import run_here
+from ibrobot_testing import ibrobot_command
 
 pytestmark = [
     pytest.mark.integration,  # a simulation, its policy and a recorder
@@ -34,6 +36,13 @@ def test_answers_are_equal_bit_for_bit(episode):
     changed = {each["what"] for each in model["effects"]}
     assert {each for each in changed if not each.startswith("state ")} == {"state", "environment_state"}
     assert explained["causes"] == []
+
+
+def test_observations_that_cannot_be_print_no_warnings_of_libraries(episode):
+    command = [*ibrobot_command(), "explain", str(episode), "--model", "."]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "How far its answers move" in done.stdout
+    assert "Warning" not in done.stderr, "e.g. of a quaternion of zeros"
 
 
 def test_unknown_model_is_named(episode):
