@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import math
+import os
 import sys
 import threading
 from collections.abc import Mapping, Sequence
@@ -86,6 +87,8 @@ class Emulate:
 
         if self.link is not None and self.link.exists() and not self.link.is_symlink():
             raise RequestError(f"--link: {self.link} exists already and is not a link: choose another path")
+        if self.link is not None and not os.access(self.link.parent, os.W_OK | os.X_OK):
+            raise RequestError(f"--link: {self.link}: you cannot write into {self.link.parent}, or it is no folder")
         if self.cables and not self.mechanics:
             raise RequestError(
                 "--cable needs --mechanics: without it joints follow their goals, whatever is in the way"
