@@ -16,6 +16,7 @@ from ibrobot_core.descriptors import (
     ReaderDescriptor as ReaderDescriptor,
     DecoderDescriptor as DecoderDescriptor,
     ViewerDescriptor as ViewerDescriptor,
+    ConfigFile as ConfigFile,
     Check as Check,
     Late as Late,
 )
@@ -127,6 +128,7 @@ from ibrobot_core.errors import (
     how_to_install as how_to_install,
     NotSupported as NotSupported,
     PlanningError as PlanningError,
+    PlanCode as PlanCode,
     PolicyError as PolicyError,
     RecorderError as RecorderError,
     SensorError as SensorError,

@@ -6,9 +6,7 @@ from ibrobot_core.descriptors import (
     SectionDescriptor as SectionDescriptor,
     Kind as Kind,
     SourceDescriptor as SourceDescriptor,
-    TerminalDescriptor as TerminalDescriptor,
     UnitsDescriptor as UnitsDescriptor,
-    ConfigFile as ConfigFile,
     FeatureDescriptor as FeatureDescriptor,
 )
 
@@ -79,13 +77,10 @@ from ibrobot_core.launch.absence import absent_sensors as absent_sensors, notes_
 from ibrobot_core.component import SourceWorker as SourceWorker
 from ibrobot_core.launch.sources.policy import PolicySource as PolicySource
 from ibrobot_core.launch.sources.operator_devices import OperatorDevices as OperatorDevices
-from ibrobot_core.interfaces import operate as operate, begin_operation as begin_operation
-from ibrobot_core.deadman import HOLD_S as HOLD_S
 from ibrobot_core.control.spline import Spline as Spline
 
 # Planning
 from ibrobot_core.interfaces.guard import Guard as Guard
-from ibrobot_core.errors import PlanCode as PlanCode
 
 # Topics and services
 from ibrobot_core.config.describe import described as described, type_name as type_name
@@ -95,12 +90,9 @@ from ibrobot_core.services import (
     NoRequest as NoRequest,
     RequestLimits as RequestLimits,
 )
-from ibrobot_core.launch.authority import AGENT_LOG as AGENT_LOG, Agent as Agent, Authority as Authority, Grant as Grant
-from ibrobot_core.interfaces.transport import HANDLER_THREADS as HANDLER_THREADS
+from ibrobot_core.launch.authority import Agent as Agent, Authority as Authority, Grant as Grant
 from ibrobot_core.interfaces.policy import (
     check_finite as check_finite,
-    check_tensors as check_tensors,
-    copied_tensors as copied_tensors,
 )
 
 # Episodes and datasets
@@ -144,9 +136,8 @@ from ibrobot_core.channel import Channel as Channel, ChannelMessage as ChannelMe
 from ibrobot_core.child import Child as Child, run_child as run_child
 from ibrobot_core.memory import create_memory as create_memory, set_malloc as set_malloc
 from ibrobot_core.control.realtime import go_real_time as go_real_time
-from ibrobot_core.bug_reports import as_failure as as_failure
 from ibrobot_core.component import raise_thread_priority as raise_thread_priority
-from ibrobot_core.pulses import PULSE_S as PULSE_S, Pulse as Pulse
+from ibrobot_core.pulses import Pulse as Pulse
 
 # Errors
 from ibrobot_core.errors import (

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import threading
+from typing import ClassVar
 
 from ibrobot_core.units import ns
 
-HOLD_S = 0.3
-"""Longest motion after the last report of an engaged device, braking included [s]."""
 _BRAKING_S = 0.1
 """Braking time until `Deadman.braking_s` is set [s]."""
 _MARGIN_S = 0.06
-"""Part of `HOLD_S` for the control loop and the host [s]."""
+"""Part of `Deadman.hold_s` for the control loop and the host [s]."""
 _LEAST_SILENCE_S = 0.05
 """Shortest silence that disarms [s]; devices report at least three times as often."""
 LONGEST_BRAKING_S = 0.2
-"""Longest time to brake with which motion ends within `HOLD_S` [s]: the shortest silence, and as much for the control
+"""Longest time to brake with which motion ends within `hold_s` [s]: the shortest silence, and as much for the control
 loop and the host, come first."""
 _LATE_NS = ns(0.1)
 """Time after a pause of the host in which reports from before the pause may still be read [ns]."""
@@ -28,7 +27,7 @@ class Deadman:
       while `allows`, which it asks at every tick.
     - `disarm` follows an activation (launch, mode switch, change of control, reset), a fault, a loss and a stop.
       Reports made before it do not count.
-    - Silence disarms: without a report, motion ends within `HOLD_S` of the last one, braking included. A pause of the
+    - Silence disarms: without a report, motion ends within `hold_s` of the last one, braking included. A pause of the
       host between two calls of `allows` disarms, too.
 
     All times are of one clock, e.g. the stamps of measurements [ns]. Thread-safe.
@@ -36,6 +35,9 @@ class Deadman:
     Attributes:
         braking_s: how long the robot takes to stop from its present velocity [s]; the run updates it.
     """
+
+    hold_s: ClassVar[float] = 0.3
+    """Longest motion after the last report of an engaged device, braking included [s]."""
 
     def __init__(self) -> None:
         self.braking_s = _BRAKING_S
@@ -53,7 +55,7 @@ class Deadman:
     @property
     def silence_ns(self) -> int:
         """The silence that disarms at present [ns]."""
-        return ns(max(_LEAST_SILENCE_S, HOLD_S - _MARGIN_S - self.braking_s))
+        return ns(max(_LEAST_SILENCE_S, self.hold_s - _MARGIN_S - self.braking_s))
 
     @property
     def reported(self) -> bool:
@@ -90,7 +92,7 @@ class Deadman:
         """Whether the deadman allows motion at a time [ns]; to be called at every tick."""
         with self._lock:
             asked_ns, self._asked_ns = self._asked_ns, now_ns
-            if asked_ns is not None and now_ns - asked_ns > ns(HOLD_S):
+            if asked_ns is not None and now_ns - asked_ns > ns(self.hold_s):
                 self._disarm(now_ns + _LATE_NS)
             elif self._pressed and abs(now_ns - self._made_ns) > self.silence_ns:
                 self._disarm(now_ns)

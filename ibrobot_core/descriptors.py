@@ -344,11 +344,6 @@ class ViewerDescriptor(Descriptor["interfaces.Viewer"]):
 
 
 @attrs.frozen
-class TerminalDescriptor(Descriptor[Any]):
-    """What reads the keys of a terminal and shows runs in it: `make` gives a `RunTerminal`."""
-
-
-@attrs.frozen
 class UnitsDescriptor(Descriptor[Any]):
     """Units of policies other than radians, `norm_mode` of a model, and features of their actions."""
 

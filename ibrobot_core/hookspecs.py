@@ -100,8 +100,8 @@ def ibrobot_viewers() -> Iterable[descriptors.ViewerDescriptor]:  # type: ignore
 
 
 @hookspec
-def ibrobot_terminals() -> Iterable[descriptors.TerminalDescriptor]:  # type: ignore[empty-body]
-    """Terminals, which read keys and show runs."""
+def ibrobot_terminals() -> Iterable[descriptors.Descriptor]:  # type: ignore[empty-body, type-arg]
+    """Terminals, which read keys and show runs: `make` gives a `RunTerminal`."""
 
 
 @hookspec

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import ClassVar
 
 import attrs
-
-PULSE_S = 0.1
-"""Longest wait of a thread between two signs of life [s]."""
 
 
 @attrs.define(eq=False)
@@ -20,6 +18,8 @@ class Pulse:
         longest_s: time without a sign after which the thread counts as blocked [s].
     """
 
+    period_s: ClassVar[float] = 0.1
+    """Longest wait of a thread between two signs of life [s]."""
     name: str
     longest_s: float
     _beats: int = 0
@@ -47,6 +47,6 @@ class Pulse:
         Time in which nobody asked does not count, since then the whole process may have been stopped.
         """
         beats = self._beats
-        self._silent_s = 0.0 if beats != self._seen or self._paused else self._silent_s + min(passed_s, PULSE_S)
+        self._silent_s = 0.0 if beats != self._seen or self._paused else self._silent_s + min(passed_s, self.period_s)
         self._seen = beats
         return self._silent_s > self.longest_s

@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args, get_origin
 import attrs
 
 from ibrobot_core.component_config import ComponentConfig, NamedComponentConfig, component_of
-from ibrobot_core.deadman import HOLD_S
+from ibrobot_core.deadman import Deadman
 from ibrobot_core.errors import PluginNotInstalled
 from ibrobot_core.messages import Image
 from ibrobot_core.options import documented, fields, not_a_key, option
@@ -420,9 +420,9 @@ class ControlConfig:
         help="longest motion while the host process, or the control loop, is stopped or blocked, braking included",
     )
     stop_time: float = option(
-        HOLD_S,
+        Deadman.hold_s,
         unit="s",
-        ge=HOLD_S,
+        ge=Deadman.hold_s,
         help="longest time, at full speed, until joints rest after the last report of the device that drives them; "
         "joints that need longer to brake are refused",
     )

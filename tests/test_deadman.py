@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakeTeleop
 
-from ibrobot_core.deadman import HOLD_S, Deadman
+from ibrobot_core.deadman import Deadman
 from ibrobot_core.interfaces import teleop
 from ibrobot_core.units import ns
 
@@ -101,7 +101,7 @@ def test_silence_and_braking_end_within_the_limit(braking_s: float):
     deadman.braking_s = braking_s
     ended_ns = next(now for now in range(T0, T0 + ns(1), TICK) if not deadman.allows(now))
     if braking_s <= 0.15:
-        assert ended_ns - T0 + ns(braking_s) <= ns(HOLD_S)
+        assert ended_ns - T0 + ns(braking_s) <= ns(Deadman.hold_s)
     assert ended_ns - T0 >= 4 * TICK, "reports at 60 Hz do not count as silence"
 
 
@@ -154,7 +154,7 @@ def test_motion_needs_a_release_and_then_a_press_since_the_last_event(events: li
     deadman.disarm(now_ns)
     for event, ticks in events:
         if event == "pause":
-            now_ns += ns(HOLD_S) + TICK
+            now_ns += ns(Deadman.hold_s) + TICK
             deadman.allows(now_ns)
             now_ns += 11 * TICK  # reports from before the pause
             deadman.allows(now_ns)

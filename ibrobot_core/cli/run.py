@@ -28,7 +28,7 @@ from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Session
 from ibrobot_core.output_thread import discard, output_aside
 from ibrobot_core.plugins import Registry, installed_plugins
-from ibrobot_core.pulses import PULSE_S, Pulse
+from ibrobot_core.pulses import Pulse
 from ibrobot_core.run_hooks import RunHooks
 from ibrobot_core.safe_output import echo
 from ibrobot_core.signals import end_signals
@@ -238,7 +238,7 @@ def _listen(session: Session, take: Callable[[str, int], None]) -> None:
         while True:
             pulse.beat()
             with suppress(queue.Empty):
-                key = keys.get(timeout=PULSE_S)
+                key = keys.get(timeout=Pulse.period_s)
                 if key == "esc":
                     _try(session, session.emergency_stop)
                 else:

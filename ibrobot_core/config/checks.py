@@ -14,7 +14,7 @@ from ibrobot_core.config.missing import Missing
 from ibrobot_core.config.structure import MODELS, ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.convert import Key
-from ibrobot_core.deadman import HOLD_S, LONGEST_BRAKING_S
+from ibrobot_core.deadman import LONGEST_BRAKING_S, Deadman
 from ibrobot_core.descriptors import ExecutorDescriptor
 from ibrobot_core.options import OptionFault
 from ibrobot_core.plugins import example_type
@@ -213,11 +213,11 @@ class Checks:
         moved = {joint for group in groups for joint in robot.groups.get(group, robot.joint_names)}
         for i, joint in enumerate(robot.joints):
             braking_s = float(robot.braking_s[i])
-            if joint.name in moved and braking_s + HOLD_S - LONGEST_BRAKING_S > longest_s:
+            if joint.name in moved and braking_s + Deadman.hold_s - LONGEST_BRAKING_S > longest_s:
                 enough = joint.max_velocity / LONGEST_BRAKING_S
                 message = (
                     f"{joint.name} brakes from {joint.max_velocity:g} rad/s in {braking_s:.2f} s, so that a released "
-                    f"deadman would stop it after up to {braking_s + HOLD_S - LONGEST_BRAKING_S:.2f} s; write "
+                    f"deadman would stop it after up to {braking_s + Deadman.hold_s - LONGEST_BRAKING_S:.2f} s; write "
                     f"{math.ceil(enough * 10) / 10:g} or more, lower max_velocity, or accept it by control.stop_time"
                 )
                 self.document.add(("robot", "joints", i, "max_acceleration"), message)

@@ -18,6 +18,6 @@ from ibrobot_core.interfaces.policy import Frame, PictureCodec, Policy, PolicySp
 from ibrobot_core.interfaces.reader import EpisodeAddress, EpisodeReader
 from ibrobot_core.interfaces.recorder import EpisodeEnd, EpisodeStart, Recorder
 from ibrobot_core.interfaces.sensor import Sensor
-from ibrobot_core.interfaces.teleop import OperatorEvent, Teleop, TeleopCommand, begin_operation, operate
+from ibrobot_core.interfaces.teleop import OperatorEvent, Teleop, TeleopCommand
 from ibrobot_core.interfaces.transport import Handler, Payload, Transport
 from ibrobot_core.interfaces.viewer import Viewer

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 from abc import ABC, abstractmethod
@@ -86,36 +87,6 @@ class PolicySpec:
     """Unit of joint positions in training, as under `models`; None if the checkpoint does not state it."""
 
 
-def copied_tensors(tensors: Tensors) -> dict[str, NDArray[np.generic]]:
-    """Copies of arrays, e.g. of outputs that the next `infer` would overwrite."""
-    return {name: np.array(array) for name, array in tensors.items()}
-
-
-def check_tensors(
-    tensors: Tensors, expected: Mapping[str, tuple[np.dtype[Any], tuple[int, ...]]], *, others: bool = False
-) -> None:
-    """Check that a request, which may be from an untrusted client, has the tensors that `preprocess` makes.
-
-    Args:
-        tensors: the request.
-        expected: name -> dtype and shape; -1 in a shape means any size except 0.
-        others: whether it may have tensors of other names.
-
-    Raises:
-        PolicyError: names all tensors that do not fit.
-    """
-    wrong = []
-    for name, (dtype, shape) in expected.items():
-        array = tensors.get(name)
-        if array is None or array.dtype != dtype or not _fits(array.shape, shape):
-            got = "is missing" if array is None else f"is {array.dtype} {array.shape}"
-            wrong.append(f"{name} {got}, must be {dtype} {shape}")
-    if not others:
-        wrong += [f"{name} is unknown" for name in tensors if name not in expected]
-    if wrong:
-        raise PolicyError(f"the request's tensors: {'; '.join(wrong)}")
-
-
 def _fits(shape: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
     return len(shape) == len(wanted) and all(n == m or (m == -1 and n > 0) for n, m in zip(shape, wanted, strict=True))
 
@@ -178,6 +149,34 @@ class Policy(ABC):
             PolicyError: if tensors are missing or have a wrong dtype or shape; names them.
         """
 
+    def check_tensors(
+        self,
+        tensors: Tensors,
+        expected: Mapping[str, tuple[np.dtype[Any], tuple[int, ...]]],
+        *,
+        others: bool = False,
+    ) -> None:
+        """For `check`: check that a request has the tensors that `preprocess` makes.
+
+        Args:
+            tensors: the request.
+            expected: name -> dtype and shape; -1 in a shape means any size except 0.
+            others: whether it may have tensors of other names.
+
+        Raises:
+            PolicyError: names all tensors that do not fit.
+        """
+        wrong = []
+        for name, (dtype, shape) in expected.items():
+            array = tensors.get(name)
+            if array is None or array.dtype != dtype or not _fits(array.shape, shape):
+                got = "is missing" if array is None else f"is {array.dtype} {array.shape}"
+                wrong.append(f"{name} {got}, must be {dtype} {shape}")
+        if not others:
+            wrong += [f"{name} is unknown" for name in tensors if name not in expected]
+        if wrong:
+            raise PolicyError(f"the request's tensors: {'; '.join(wrong)}")
+
     @abstractmethod
     def infer(self, tensors: Tensors) -> Tensors:
         """Compute raw outputs from inputs. The heavy step.
@@ -195,7 +194,7 @@ class Policy(ABC):
 
         By default, one after the other. The outputs of a batch share no memory; the next call may overwrite them.
         """
-        return [copied_tensors(self.infer(tensors)) for tensors in batch]
+        return [copy.deepcopy(self.infer(tensors)) for tensors in batch]
 
     def fingerprint(self) -> str:
         """Fingerprint on which both sides of `infer` must agree: by default of the spec; policies may add statistics.

@@ -106,6 +106,34 @@ class Teleop(ABC):
         """Instructions for the operator, in a few lines: keys, buttons."""
         return ""
 
+    def begin_operation(self, measured: JointReading) -> None:
+        """Let it start from the measured position, with its deadman disarmed."""
+        self.deadman.disarm(measured.stamp_ns)
+        self.activate(measured)
+
+    def operate(self, measured: JointReading) -> TeleopCommand:
+        """Its command, without positions that its deadman does not allow.
+
+        Raises:
+            TeleopError: as `read`, or if the device commands positions and never reports its deadman.
+        """
+        deadman, now_ns = self.deadman, measured.stamp_ns
+        try:
+            command = self.read(measured)
+        except TeleopError:
+            deadman.disarm(now_ns)
+            raise
+        if command.estop:
+            deadman.disarm(now_ns)
+        if deadman.allows(now_ns) or deadman.brakes(now_ns) or command.positions is None or not self.operated:
+            return command
+        if not deadman.reported:
+            raise TeleopError(
+                f"{type(self).__name__} commands positions without a deadman: its read must call self.deadman.report, "
+                "or its class say operated = False"
+            )
+        return attrs.evolve(command, positions=None)
+
 
 class Approach:
     """The setpoints of a robot that approaches the pose of a leader at first, and then follows it directly.
@@ -143,33 +171,3 @@ class Approach:
         share = float(np.min(speed * elapsed_s / np.maximum(np.abs(way), 1e-9)))
         self.setpoint = pose if self.following or share >= 1.0 else self.setpoint + way * share
         return self.setpoint
-
-
-def begin_operation(device: Teleop, measured: JointReading) -> None:
-    """Let a device start from the measured position, with its deadman disarmed."""
-    device.deadman.disarm(measured.stamp_ns)
-    device.activate(measured)
-
-
-def operate(device: Teleop, measured: JointReading) -> TeleopCommand:
-    """The device's command, without positions that its deadman does not allow.
-
-    Raises:
-        TeleopError: as `Teleop.read`, or if the device commands positions and never reports its deadman.
-    """
-    deadman, now_ns = device.deadman, measured.stamp_ns
-    try:
-        command = device.read(measured)
-    except TeleopError:
-        deadman.disarm(now_ns)
-        raise
-    if command.estop:
-        deadman.disarm(now_ns)
-    if deadman.allows(now_ns) or deadman.brakes(now_ns) or command.positions is None or not device.operated:
-        return command
-    if not deadman.reported:
-        raise TeleopError(
-            f"{type(device).__name__} commands positions without a deadman: its read must call self.deadman.report, "
-            "or its class say operated = False"
-        )
-    return attrs.evolve(command, positions=None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from typing import ClassVar
 
 type Payload = bytes | bytearray | memoryview
 """Flat bytes. Received payloads are read-only and live as long as they are referenced."""
@@ -12,15 +13,15 @@ type Handler = Callable[[Payload, str | None], Payload]
 """Computes the answer to a request. It receives the request and the sender's name, which the transport has verified by
 a certificate or password, or None if it is not verified."""
 
-HANDLER_THREADS = 16
-"""Default of `workers` in `serve`: maximum number of concurrent calls of a handler."""
-
 
 class Transport(ABC):
     """Publish, subscribe, and request with a reply. Payloads are bytes, whose meaning is up to the caller.
 
     The caller may modify payloads of `publish` and `request` after the call has returned.
     """
+
+    handler_threads: ClassVar[int] = 16
+    """Default of `workers` in `serve`: maximum number of concurrent calls of a handler."""
 
     @abstractmethod
     def publish(self, topic: str, payload: Payload) -> None:
@@ -38,7 +39,7 @@ class Transport(ABC):
         """
 
     @abstractmethod
-    def serve(self, name: str, handler: Handler, *, workers: int = HANDLER_THREADS) -> Callable[[], None]:
+    def serve(self, name: str, handler: Handler, *, workers: int = handler_threads) -> Callable[[], None]:
         """Answer requests for `name`; returns a function that ends the service.
 
         Args:

@@ -18,7 +18,7 @@ from ibrobot_core.errors import ComponentFailed, HardwareError
 from ibrobot_core.interfaces.run_state import ControlState
 from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import JOINT_STATES, Float64MultiArray, Header, JointState, String
-from ibrobot_core.pulses import PULSE_S
+from ibrobot_core.pulses import Pulse
 from ibrobot_core.schema import ControlMode, RobotConfig
 
 _PATIENCE_S = 1.0
@@ -108,14 +108,14 @@ class ControlComponent(Component):
     def _check_threads(self, control: ControlClient) -> None:
         """End the run if a thread that a STOP goes through hangs; have the robot hold if the main thread does not."""
         session, now_s = self._session, time.monotonic()
-        if now_s - self._checked_s < PULSE_S:
+        if now_s - self._checked_s < Pulse.period_s:
             return
         passed_s, self._checked_s = now_s - self._checked_s, now_s
         for late in [pulse for pulse in set(session.pulses) if pulse.is_late(passed_s)]:
             failure = f"does not react for {late.longest_s:g} s: STOP would be late there"
             session.fail(late.name, ComponentFailed(failure))
         ending = session.finished.is_set() and not session.stopping.is_set()
-        self._ending_s = self._ending_s + min(passed_s, 2 * PULSE_S) if ending else 0.0
+        self._ending_s = self._ending_s + min(passed_s, 2 * Pulse.period_s) if ending else 0.0
         if self._ending_s > _PATIENCE_S and not self._held:
             self._held = True
             control.raise_fault("the run ends, but its main thread is busy")

@@ -10,7 +10,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.bug_reports import as_failure, error_line, error_text, exit_code
+from ibrobot_core.bug_reports import error_line, error_text, exit_code
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.component import Component
 from ibrobot_core.config.missing import absent_models, unavailable_modes
@@ -422,7 +422,7 @@ class Runtime:
 
     def _end_with(self, dead: threading.ExceptHookArgs) -> None:
         name = dead.thread.name if dead.thread is not None else "a thread"
-        self.session.fail(f"thread {name!r}", as_failure(dead.exc_value or dead.exc_type()))
+        self.session.fail(f"thread {name!r}", dead.exc_value or dead.exc_type())
 
 
 @contextmanager

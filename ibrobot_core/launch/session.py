@@ -56,8 +56,9 @@ class Session:
         failure: the component that died and why; None without a failure.
         finished: set when the run should stop.
         stopping: set once the main thread stops the components.
-        pulses: signs of life of the threads between a STOP and control. Add one, beat it at least every `PULSE_S`, and
-            remove it when the thread ends in an orderly way; a thread that stays silent for too long ends the run.
+        pulses: signs of life of the threads between a STOP and control. Add one, beat it at least every
+            `Pulse.period_s`, and remove it when the thread ends in an orderly way; a thread that stays silent for too
+            long ends the run.
         operator_events: the operator's button presses on a teleoperation device, e.g. to begin and end episodes.
         log: the log of the run.
         command_source: the source that commands the active executors.
@@ -317,7 +318,7 @@ class Session:
         except IbrobotError:
             raise
         except BaseException as error:  # e.g. no memory: it may not have been sent, and the next one would not be
-            self.fail("emergency stop", as_failure(error))
+            self.fail("emergency stop", error)
             with suppress(Exception):
                 self._control.call(commands.RaiseFault("an emergency stop could not be sent"))
             raise
@@ -415,8 +416,8 @@ class Session:
         """End the run in an orderly way."""
         self.finished.set()
 
-    def fail(self, component: str, error: Exception) -> None:
+    def fail(self, component: str, error: BaseException) -> None:
         """End the run because `component` died; only the first cause is reported."""
         if self.failure is None and not self.finished.is_set():
-            self.failure = (component, error)
+            self.failure = (component, as_failure(error))
         self.finished.set()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.control.plausible import Plausibility
 from ibrobot_core.errors import TeleopError
-from ibrobot_core.interfaces import JointReading, Teleop, TeleopCommand, begin_operation, operate
+from ibrobot_core.interfaces import JointReading, Teleop, TeleopCommand
 from ibrobot_core.interfaces.run import StreamingRun
 from ibrobot_core.pulses import Pulse
 from ibrobot_core.robot import Robot, Vector
@@ -129,7 +129,7 @@ class OperatorDevices:
     def activate(self, measured: JointReading) -> None:
         """Let all devices start from the measured position; see `Teleop.activate`."""
         for each in self._connected:
-            begin_operation(each.device, measured.of(each.columns))
+            each.device.begin_operation(measured.of(each.columns))
             each.followed = None
             each.device.deadman.disarm(self._session.clock.now_ns())  # reports since the measurement do not count
 
@@ -152,7 +152,7 @@ class OperatorDevices:
             own = measured.of(each.columns)
             each.device.deadman.braking_s = self._braking_s(own, each.columns)
             try:
-                commands.append(each.believed(operate(each.device, own), own, self._patience_ns))
+                commands.append(each.believed(each.device.operate(own), own, self._patience_ns))
             except TeleopError as error:
                 each.lost = True
                 faults.append(str(error))

@@ -37,7 +37,7 @@ from ibrobot_core.api import (
     Vector3,
     ns,
 )
-from ibrobot_core.app import RequestError, begin_operation, operate
+from ibrobot_core.app import RequestError
 
 AXES = {
     "shoulder_pan": "0 0 1",
@@ -130,7 +130,7 @@ class Rig:
         self.follows = True
         self.teleop = TwistTeleop(options, self.ctx)
         self.teleop.connect()
-        begin_operation(self.teleop, self.measured())
+        self.teleop.begin_operation(self.measured())
         for _ in range(30):  # no stream goes on
             self.tick()
         self.positions.clear()
@@ -143,7 +143,7 @@ class Rig:
         self.ctx.clock.sleep_until(self.ctx.clock.now_ns() + ns(DT))
         for message in messages:
             self.bus.publish(topic, message)
-        positions = operate(self.teleop, self.measured()).positions
+        positions = self.teleop.operate(self.measured()).positions
         self.commanded = positions is not None
         for name, position in (positions or {}).items():
             if self.follows:
@@ -181,7 +181,7 @@ def test_only_joints_that_move_the_tool_are_commanded(model):
     rig = Rig(model)
     rig.bus.publish(TOPIC, twist())
     rig.ctx.clock.sleep_until(rig.ctx.clock.now_ns() + ns(DT))
-    positions = operate(rig.teleop, rig.measured()).positions
+    positions = rig.teleop.operate(rig.measured()).positions
     assert positions is not None
     assert "gripper" not in positions
     assert len(positions) == 5
@@ -229,7 +229,7 @@ def test_a_stream_that_goes_on_over_a_reset_moves_nothing_before_a_zero_twist_or
     for release in ([twist((0.0, 0.0, 0.0))], [None] * 51):
         rig = Rig(model)
         assert rig.follow(twist(), 0.3).any()
-        begin_operation(rig.teleop, rig.measured())
+        rig.teleop.begin_operation(rig.measured())
         assert not rig.follow(twist(), 2.0).any()
         assert any("the stream went on" in reason for reason in rig.counts())
         for message in release:
@@ -244,7 +244,7 @@ def test_a_joint_that_does_not_follow_makes_the_tool_wait(model):
     for _ in range(300):
         rig.bus.publish(TOPIC, twist((0.1, 0, 0)))
         rig.ctx.clock.sleep_until(rig.ctx.clock.now_ns() + ns(DT))
-        positions = operate(rig.teleop, rig.measured()).positions or {}
+        positions = rig.teleop.operate(rig.measured()).positions or {}
         lead = [
             abs(at - BENT[rig.robot.joint_names.index(name)]) / rig.robot.max_lead[0] for name, at in positions.items()
         ]
@@ -425,7 +425,7 @@ class Arm:
         self.ctx = attrs.evolve(host_context("twist", robot=self.robot, clock=SetClock(START_NS)), session=session)
         self.teleop = TwistTeleop(TwistOptions(path_constraints=UPRIGHT), self.ctx)
         self.teleop.connect()
-        begin_operation(self.teleop, self.reading())
+        self.teleop.begin_operation(self.reading())
         kinematics = robot_model(self.robot)
         self.constraints = ToolConstraints(UPRIGHT, kinematics, LEVEL)
         self.excess = [-0.1]
@@ -441,7 +441,7 @@ class Arm:
         assert self.ctx.bus is not None
         for message in messages:
             self.ctx.bus.publish(TOPIC, message)
-        for name, position in (operate(self.teleop, self.reading()).positions or {}).items():
+        for name, position in (self.teleop.operate(self.reading()).positions or {}).items():
             index = self.robot.joint_names.index(name)
             if name != self.held_back:
                 self.command[index] = position

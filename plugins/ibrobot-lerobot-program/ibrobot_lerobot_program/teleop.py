@@ -22,11 +22,9 @@ from ibrobot_core.api import (
 from ibrobot_core.app import (
     RobotConfig,
     RunTerminal,
-    begin_operation,
     find_config,
     installed_plugins,
     load_config,
-    operate,
 )
 from ibrobot_lerobot_program.features import RobotFeatures
 from ibrobot_lerobot_program.link import ProgramLink
@@ -121,8 +119,8 @@ class ProgramTeleop:
         measured = self._measured()
         if self._command is None:  # LeRobot connects teleoperators before robots
             self._command = measured.copy()
-            begin_operation(self._device, self._reading(measured))
-        command = operate(self._device, self._reading(measured))
+            self._device.begin_operation(self._reading(measured))
+        command = self._device.operate(self._reading(measured))
         if command.estop:
             raise TeleopError(f"{self._name}: emergency stop")
         for joint, position in (command.positions or {}).items():

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 import attrs
 
 from ibrobot_core.api import OptionFault, Options, documented, option
-from ibrobot_core.app import AGENT_LOG, RUN_KEYS, check_key
+from ibrobot_core.app import RUN_KEYS, check_key
 
 if TYPE_CHECKING:
     from ibrobot_core.app import RobotConfig, RunView
 
 COMMANDER = "/commander"
 """Topic (std_msgs/msg/String) with who commands the robot at each state of control, in modes with `intervene`."""
-GUARD = "/guard"
-LABELS = (COMMANDER, GUARD, AGENT_LOG)
+GUARD, AGENTS = "/guard", "/agent/log"
+LABELS = (COMMANDER, GUARD, AGENTS)
 """Topics beside those of the contract: who commanded, what the guard of control kept apart, what agents asked for."""
 POLICY, OPERATOR, HANDOVER = "policy", "operator", "handover"
 """The words on `COMMANDER`; in a handover nobody commands, and the arm holds."""

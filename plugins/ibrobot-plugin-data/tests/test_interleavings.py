@@ -20,6 +20,7 @@ from ibrobot_testing.fakes import FakeTeleop
 
 from ibrobot_core.api import (
     NS_PER_S,
+    Deadman,
     FollowTrajectory,
     Header,
     IbrobotError,
@@ -30,7 +31,7 @@ from ibrobot_core.api import (
     TeleopDescriptor,
     ns,
 )
-from ibrobot_core.app import HOLD_S, ComponentFailed, ControlState, Registry
+from ibrobot_core.app import ComponentFailed, ControlState, Registry
 from ibrobot_core.interfaces.run_state import PlanRecord
 
 if TYPE_CHECKING:
@@ -288,7 +289,7 @@ class Story:
                 self.seen["braking"] += int(np.abs(step).max() > STILL_RAD)
             elif not self.settles and not self.consent and faster.any():
                 assert self.run.session.mode in ("teleop", "policy"), "nobody asked for this motion"
-                assert state.stamp_ns - Lever.allowed_ns <= ns(HOLD_S), "no deadman allows this motion"
+                assert state.stamp_ns - Lever.allowed_ns <= ns(Deadman.hold_s), "no deadman allows this motion"
                 self.seen["by deadman"] += 1
             else:
                 self.seen["moves"] += int(faster.any())

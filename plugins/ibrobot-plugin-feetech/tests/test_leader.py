@@ -28,7 +28,6 @@ from ibrobot_core.api import (
     TeleopError,
     Vector,
 )
-from ibrobot_core.app import begin_operation, operate
 
 from .conftest import JOINTS, OFFSETS, arm_calibration, prepare
 from .line import Line
@@ -98,7 +97,7 @@ class TestWithoutADeadman(LeaderSuite):
     def engage(self, teleop: Teleop) -> None:
         """Somebody takes the leader up."""
         still = np.zeros(6)
-        operate(teleop, JointReading(self.clock.now_ns(), still, still, still))
+        teleop.operate(JointReading(self.clock.now_ns(), still, still, still))
         self.operate(teleop)
 
 
@@ -173,14 +172,14 @@ class TeleopRig:
 
     def begin(self) -> None:
         """Begin the mode, and see the deadman released; the terminal reports releases."""
-        begin_operation(self.leader, self.measured())
+        self.leader.begin_operation(self.measured())
         self.read("release:space", "release:l")
 
     def read(self, *keys: str) -> TeleopCommand:
         for key in (self.waiting, *keys) if self.waiting else keys:
             self.typed.put(key)
         self.waiting = ""
-        command = operate(self.leader, self.measured())
+        command = self.leader.operate(self.measured())
         self.follows = command.positions is not None
         if command.positions is not None:
             for joint, position in command.positions.items():
@@ -222,7 +221,7 @@ def rig(emulator: Emulator, calibration_file: Path, request: pytest.FixtureReque
     rig = TeleopRig(emulator, calibration_file, **given)
     rig.leader.connect()
     if given.get("deadman") == "none":
-        begin_operation(rig.leader, rig.measured())
+        rig.leader.begin_operation(rig.measured())
     else:
         rig.begin()
     if "deadman" not in given:
@@ -351,7 +350,7 @@ class TestTakeover:
 
     def test_the_torque_is_off_if_the_takeover_is_broken_off(self, rig: TeleopRig):
         rig.position[0] = 1.0
-        for end in (lambda: begin_operation(rig.leader, rig.measured()), rig.leader.disconnect):
+        for end in (lambda: rig.leader.begin_operation(rig.measured()), rig.leader.disconnect):
             assert not rig.leader.approach(rig.measured())
             assert rig.register("torque_enable") == [1] * 6
             end()
@@ -385,7 +384,7 @@ class TestDeadman:
         assert rig.read().positions is None, "it trembles"
         rig.turn("shoulder_pan", 2600)
         assert rig.follow()[0] == pytest.approx(552 / RADIAN, abs=1e-3)
-        begin_operation(rig.leader, rig.measured())
+        rig.leader.begin_operation(rig.measured())
         assert rig.read().positions is None, "a reset waits again"
 
     @options(deadman="none")
@@ -424,7 +423,7 @@ class TestDeadman:
         for deadman in ("toggle", "hold"):
             rig = TeleopRig(emulator, calibration_file, deadman=deadman)
             rig.leader.connect()
-            begin_operation(rig.leader, rig.measured())
+            rig.leader.begin_operation(rig.measured())
             rig.read()
             keys = [["space"] * (i == 0 or (i >= 40 and i % 3 == 1)) for i in range(200)]
             follows[deadman] = [rig.read(*typed).positions is not None for typed in (*keys, *[[]] * 100)]
@@ -436,7 +435,7 @@ class TestDeadman:
     def test_toggle_without_reports_of_releases_starts_and_pauses_by_one_press_each(self, emulator, calibration_file):
         rig = TeleopRig(emulator, calibration_file, deadman="toggle")
         rig.leader.connect()
-        begin_operation(rig.leader, rig.measured())
+        rig.leader.begin_operation(rig.measured())
         follows = [rig.read(*["space"] * (i in (10, 200, 500))).positions is not None for i in range(600)]
         rig.leader.disconnect()
         assert np.flatnonzero(follows).tolist() == [*range(25, 200), *range(515, 600)]
@@ -452,7 +451,7 @@ class TestDeadman:
     @options(deadman="toggle")
     def test_what_was_typed_before_the_mode_began_does_not_count(self, rig: TeleopRig):
         rig.typed.put("space")
-        begin_operation(rig.leader, rig.measured())
+        rig.leader.begin_operation(rig.measured())
         assert rig.read().positions is None
 
     def test_without_a_terminal_it_is_refused(self, emulator: Emulator, calibration_file: Path):
@@ -543,11 +542,11 @@ class TestOneOfTwo:
         leader = LeaderTeleop(LeaderOptions(emulator.port, str(calibration_file), prefix="right_", deadman="none"), ctx)
         leader.connect()
         still = JointReading(START_NS, np.zeros(6), np.zeros(6), np.zeros(6))
-        begin_operation(leader, still)
-        operate(leader, attrs.evolve(still, stamp_ns=START_NS + 10_000_000))
+        leader.begin_operation(still)
+        leader.operate(attrs.evolve(still, stamp_ns=START_NS + 10_000_000))
         with emulator.lock:
             emulator.servos[1].turn(emulator.servos[1].encoder + 100)
-        positions = operate(leader, attrs.evolve(still, stamp_ns=START_NS + 100_000_000)).positions
+        positions = leader.operate(attrs.evolve(still, stamp_ns=START_NS + 100_000_000)).positions
         leader.disconnect()
         assert positions == dict.fromkeys((f"right_{name}" for name in JOINTS), 0.0), "it begins where the robot is"
 

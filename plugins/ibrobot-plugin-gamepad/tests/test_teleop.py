@@ -18,7 +18,6 @@ from ibrobot_gamepad.teleop import JogTeleop
 from ibrobot_testing import TeleopSuite, host_context, make_robot
 
 from ibrobot_core.api import Context, JointReading, OperatorEvent, Robot, Teleop, TeleopCommand, TeleopError, ns
-from ibrobot_core.app import begin_operation, operate
 
 from .fake_hid import DUALSENSE, SPACEMOUSE, FakeHidapi, Plugged, dualsense, mouse_buttons, spacemouse
 
@@ -110,7 +109,7 @@ class Rig:
         self.pad.send(dualsense())
         self.teleop = JogTeleop(self.options, host_context("pad", robot=self.robot))
         self.teleop.connect()
-        begin_operation(self.teleop, self.measured())
+        self.teleop.begin_operation(self.measured())
 
     def measured(self) -> JointReading:
         return JointReading(ns(self.time_s), self.position.copy(), np.zeros(6), np.zeros(6))
@@ -119,7 +118,7 @@ class Rig:
         if self.pad.present:
             self.pad.send(*reports)
         self.time_s += TICK_S
-        command = operate(self.teleop, self.measured())
+        command = self.teleop.operate(self.measured())
         if command.positions is not None and not self.blocked:
             self.position = self.setpoint(command)
         return command
@@ -171,7 +170,7 @@ def test_nothing_moves_without_the_deadman(rig: Rig):
 def test_what_is_held_when_the_mode_begins_counts_as_released(rig: Rig):
     rig.engage()
     rig.pad.send(dualsense(LB, left=(1, 0)))
-    begin_operation(rig.teleop, rig.measured())
+    rig.teleop.begin_operation(rig.measured())
     for _ in range(20):
         assert rig.tick(dualsense(LB, left=(1, 0))).positions is None
     rig.engage()
@@ -269,7 +268,7 @@ def test_the_stop_button_needs_no_deadman_and_releases_it(rig: Rig):
 
 def test_a_stop_pressed_while_the_mode_begins_is_not_lost(rig: Rig):
     rig.pad.send(dualsense("east"), dualsense())
-    begin_operation(rig.teleop, rig.measured())
+    rig.teleop.begin_operation(rig.measured())
     assert rig.tick().estop
 
 

@@ -16,7 +16,6 @@ from ibrobot_kinematics import robot_model
 from ibrobot_testing import TeleopSuite, host_context
 
 from ibrobot_core.api import Context, JointReading, Robot, Teleop, TeleopCommand, TeleopError, Vector, ns
-from ibrobot_core.app import begin_operation, operate
 
 from .sensor import Sensor
 
@@ -85,7 +84,7 @@ class Rig:
         ctx = host_context("imu", robot=robot, keys=lambda: self.typed)
         self.teleop = ImuTeleop(ImuOptions(sensor.port, model, **options), ctx)
         self.teleop.connect()
-        begin_operation(self.teleop, self.measured())
+        self.teleop.begin_operation(self.measured())
 
     def measured(self) -> JointReading:
         return JointReading(ns(self.time_s), self.position.copy(), np.zeros(6), np.zeros(6))
@@ -98,7 +97,7 @@ class Rig:
             self.sensor.send(sent)
         if self.tilt is not None:
             self.sensor.turn(**self.tilt)
-        command = operate(self.teleop, self.measured())
+        command = self.teleop.operate(self.measured())
         if command.positions is not None:
             self.position = np.array([command.positions[name] for name in self.robot.joint_names])
         return command
@@ -261,7 +260,7 @@ def test_an_unplugged_sensor_is_an_error_and_comes_back(start, monkeypatch: pyte
             rig.tick()
     rig.teleop.disconnect()
     rig.teleop.connect()
-    begin_operation(rig.teleop, rig.measured())
+    rig.teleop.begin_operation(rig.measured())
     rig.let_go()
     rig.press()
     assert np.linalg.norm(rig.run(0.3, pitch=0.7)) > 0.01

@@ -16,7 +16,6 @@ from ibrobot_terminal import KeyReader
 from ibrobot_testing import TeleopSuite, host_context, make_robot
 
 from ibrobot_core.api import Context, Description, Joint, JointReading, Robot, Teleop, TeleopCommand, TeleopError, ns
-from ibrobot_core.app import begin_operation, operate
 
 JOINTS = make_robot().joint_names
 MIDDLE = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
@@ -39,7 +38,7 @@ class TeleopRig:
         self.teleop = KeyboardTeleop(self.options, ctx)
         self.teleop.connect()
         self.typed.put("release:z")  # the terminal reports releases
-        begin_operation(self.teleop, self.measured())
+        self.teleop.begin_operation(self.measured())
 
     def measured(self) -> JointReading:
         return JointReading(ns(self.time_s), self.position.copy(), np.zeros(6), np.zeros(6))
@@ -48,7 +47,7 @@ class TeleopRig:
         for key in keys:
             self.typed.put(key)
         self.time_s += seconds
-        command = operate(self.teleop, self.measured())
+        command = self.teleop.operate(self.measured())
         if command.positions is not None:
             self.position = np.array([command.positions[joint] for joint in self.robot.joint_names])
         return command
@@ -141,7 +140,7 @@ def test_activation_begins_where_the_robot_is_and_forgets_what_was_typed():
     rig.position = np.zeros(6)
     for key in ("w", "space"):
         rig.typed.put(key)
-    begin_operation(rig.teleop, rig.measured())
+    rig.teleop.begin_operation(rig.measured())
     assert rig.tick() == TeleopCommand(None)
     assert rig.tick("e").positions == dict.fromkeys(JOINTS, 0.0)
 
@@ -308,7 +307,7 @@ def test_typing_in_a_terminal_moves_a_joint():
             # The reader feeds its subscribers one after another under one lock; subscribing again waits for that.
             keys.subscribe()
             _, first, second = (
-                operate(teleop, JointReading(ns(t), MIDDLE.copy(), np.zeros(6), np.zeros(6))) for t in (1.0, 1.15, 1.2)
+                teleop.operate(JointReading(ns(t), MIDDLE.copy(), np.zeros(6), np.zeros(6))) for t in (1.0, 1.15, 1.2)
             )
     finally:
         os.close(person)
@@ -326,7 +325,7 @@ def legacy_rig() -> TeleopRig:
     rig.typed = queue.SimpleQueue()
     rig.teleop = KeyboardTeleop(rig.options, host_context("keyboard", robot=rig.robot, keys=lambda: rig.typed))
     rig.teleop.connect()
-    begin_operation(rig.teleop, rig.measured())
+    rig.teleop.begin_operation(rig.measured())
     rig.tick()
     return rig
 
@@ -350,7 +349,7 @@ def test_without_reports_of_releases_a_held_key_moves_and_its_release_ends_the_m
 def test_a_key_held_over_an_activation_moves_nothing(pressed_before: int):
     rig = legacy_rig()
     press(rig, range(pressed_before))
-    begin_operation(rig.teleop, rig.measured())
+    rig.teleop.begin_operation(rig.measured())
     assert not any(press(rig, range(pressed_before, 300)))
     for _ in range(30):
         rig.tick()

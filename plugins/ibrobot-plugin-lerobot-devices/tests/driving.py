@@ -31,7 +31,7 @@ from ibrobot_core.api import (
     Vector3,
     ns,
 )
-from ibrobot_core.app import ComponentFailed, begin_operation, operate
+from ibrobot_core.app import ComponentFailed
 from ibrobot_core.config import from_document
 from ibrobot_core.control.build import build_core
 from ibrobot_core.control.commands import ClearFaults, EmergencyStop
@@ -320,7 +320,7 @@ class Drive:
         self.core.start("drive")
         world.started = True
         self.fault_ns: int | None = None
-        begin_operation(self.teleop, self._reading())
+        self.teleop.begin_operation(self._reading())
         self.tick(2.2)  # also for the process that waits
 
     def _reading(self) -> JointReading:
@@ -351,7 +351,7 @@ class Drive:
         measured = self._reading()
         speed = np.minimum(np.abs(measured.velocity), self.robot.max_velocity)  # as a run computes it
         self.teleop.deadman.braking_s = float(np.max(speed / self.robot.max_acceleration)) + 0.01
-        positions = operate(self.teleop, measured).positions
+        positions = self.teleop.operate(measured).positions
         if positions and not core.fault:
             mask, row = np.ones(3, dtype=bool), np.array([[positions[name] for name in AXES]])
             core.set_plan(PlanRecord(core.generation, now_ns, core.period_ns, mask, row))
@@ -373,7 +373,7 @@ class Drive:
         for _ in range(attempts):
             if "error" not in self.core.handle(ClearFaults()):
                 self.fault_ns = None
-                begin_operation(self.teleop, self._reading())
+                self.teleop.begin_operation(self._reading())
                 return True
             self.tick(0.2)
         return False

@@ -31,7 +31,6 @@ from ibrobot_core.api import (
     Vector3,
     ns,
 )
-from ibrobot_core.app import begin_operation, operate
 
 from .conftest import Motors
 
@@ -188,7 +187,7 @@ class Rig:
         self.teleop.connect()
         self.at = np.zeros(4)
         self.velocity = np.zeros(4)
-        begin_operation(self.teleop, self._measured())
+        self.teleop.begin_operation(self._measured())
         for _ in range(60):
             self.tick()
 
@@ -202,7 +201,7 @@ class Rig:
         for message in messages:
             self.ctx.bus.publish("/cmd_vel", message)
         before = self.at.copy()
-        positions = operate(self.teleop, self._measured()).positions
+        positions = self.teleop.operate(self._measured()).positions
         for name, position in (positions or {}).items():
             self.at[ROBOT.joint_names.index(name)] = position
         self.velocity = (self.at - before) / PERIOD_S

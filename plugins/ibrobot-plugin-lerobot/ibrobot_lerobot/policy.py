@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Context, Frame, Header, Image, PictureCodec, Policy, PolicyError, PolicySpec, Tensors
-from ibrobot_core.app import check_finite, check_tensors
+from ibrobot_core.app import check_finite
 from ibrobot_lerobot.checkpoint import (
     ACTION,
     ATTENTION,
@@ -210,7 +210,7 @@ class LeRobotPolicy(Policy):
         if self.spec.prefix and tensors.keys() & {PREFIX, DELAY}:
             expected[PREFIX] = (np.dtype(np.float32), (1, -1, self._checkpoint.action_size))
             expected[DELAY] = (np.dtype(np.int64), (1,))
-        check_tensors(tensors, expected, others=bool(self._pre.others))
+        self.check_tensors(tensors, expected, others=bool(self._pre.others))
         if PREFIX in expected:
             delay, length, most = int(tensors[DELAY][0]), tensors[PREFIX].shape[1], self._checkpoint.chunk_size
             if not 0 <= delay <= length <= most:

@@ -11,7 +11,7 @@ from typing import override
 from ibrobot_http.addresses import host_names
 from ibrobot_http.listener import listen, tls_context
 
-from ibrobot_core.app import CONTROL, Pulse, RunView, SessionWorker, as_failure
+from ibrobot_core.app import CONTROL, Pulse, RunView, SessionWorker
 from ibrobot_mcp.audit import AuditFile, authority_of
 from ibrobot_mcp.options import McpOptions
 from ibrobot_mcp.persons import Persons
@@ -124,9 +124,9 @@ class _ServerThread:
                 runner.run(self._serve())
         except Exception as error:  # noqa: BLE001 - reported to the run, which ends: an agent's stop would not be heard
             if not self._started.is_set():
-                self._failure = as_failure(error)
+                self._failure = error
             else:
-                session.fail("agents", as_failure(error))
+                session.fail("agents", error)
         finally:
             session.pulses.discard(self._pulse)
             self._started.set()

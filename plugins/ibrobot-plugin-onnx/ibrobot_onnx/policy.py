@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Context, Frame, Policy, PolicyError, PolicySpec, Tensors
-from ibrobot_core.app import check_finite, check_tensors
+from ibrobot_core.app import check_finite
 from ibrobot_onnx.manifest import NOISE, Manifest, Noise, read_manifest, stacked_shape
 from ibrobot_onnx.options import PROVIDERS, OnnxPolicyOptions
 
@@ -141,7 +141,7 @@ class OnnxPolicy(Policy):
         if not self._sessions:
             raise PolicyError(f"{self._options.path} is not loaded: call load() first")
         for tensors in batch:
-            check_tensors(tensors, self._expected)
+            self.check_tensors(tensors, self._expected)
         return [{ACTION: actions} for actions in self._run(self._sessions, batch, _LATER_S * len(batch), "a request")]
 
     @override

@@ -15,6 +15,7 @@ from ibrobot_core.api import (
     Context,
     IbrobotError,
     JointTrajectory,
+    PlanCode,
     PlanningError,
     Pose,
     Quaternion,
@@ -23,7 +24,7 @@ from ibrobot_core.api import (
     Transport,
     Vector3,
 )
-from ibrobot_core.app import PlanCode, Runtime, installed_plugins, single_options
+from ibrobot_core.app import Runtime, installed_plugins, single_options
 from ibrobot_planning.execution.results import MoveResult
 from ibrobot_planning.execution.source import EXECUTE
 

@@ -19,12 +19,13 @@ from ibrobot_core.api import (
     Header,
     JointTrajectory,
     JointTrajectoryPoint,
+    PlanCode,
     PlanningError,
     Vector,
     ns,
     seconds,
 )
-from ibrobot_core.app import Guard, PlanCode
+from ibrobot_core.app import Guard
 from ibrobot_planning.planner import ConstrainedGoal, JointGoal, Planner, PlanRequest, PlanResult
 
 

@@ -30,6 +30,7 @@ from ibrobot_core.api import (
     JointTrajectory,
     JointTrajectoryPoint,
     Options,
+    PlanCode,
     PlanningError,
     Pose,
     Vector,
@@ -38,7 +39,6 @@ from ibrobot_core.api import (
     ns,
     option,
 )
-from ibrobot_core.app import PlanCode
 
 DT = 0.02
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from ibrobot_planning.client import Client
 
-from ibrobot_core.api import PlanningError
-from ibrobot_core.app import PlanCode, Runtime
+from ibrobot_core.api import PlanCode, PlanningError
+from ibrobot_core.app import Runtime
 
 from .conftest import Make
 from .table_arm import ARM

@@ -14,8 +14,7 @@ from ibrobot_planning.world.collision import Collisions, unchecked_pairs
 from ibrobot_planning.world.objects import Box, Capsule, Cylinder, Mesh, Plane, Sphere, World, WorldObject
 from ibrobot_planning.world.voxels import voxels
 
-from ibrobot_core.api import PlanningError, Pose, Vector3
-from ibrobot_core.app import PlanCode
+from ibrobot_core.api import PlanCode, PlanningError, Pose, Vector3
 
 from .table_arm import ARM, JOINTS, box, write_arm
 

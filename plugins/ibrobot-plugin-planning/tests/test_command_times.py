@@ -18,6 +18,7 @@ from ibrobot_core.api import (
     Header,
     JointTrajectory,
     Message,
+    PlanCode,
     PlanningError,
     Pose,
     PoseStamped,
@@ -26,7 +27,7 @@ from ibrobot_core.api import (
     Vector3,
     ns,
 )
-from ibrobot_core.app import PlanCode, Runtime
+from ibrobot_core.app import Runtime
 
 from .conftest import Make
 from .table_arm import JOINTS

@@ -12,8 +12,8 @@ from ibrobot_planning.execution.results import MoveResult
 from ibrobot_planning.execution.source import CANCEL, GO_TO, RESULT, PlannerSource
 from ibrobot_planning.planner import AnyGoal, Goal, JointGoal, LinearGoal, PlanRequest, PlanResult, PositionGoal
 
-from ibrobot_core.api import PlanningError, Vector3
-from ibrobot_core.app import PlanCode, Runtime
+from ibrobot_core.api import PlanCode, PlanningError, Vector3
+from ibrobot_core.app import Runtime
 
 from .conftest import Make
 from .table_arm import ARM, WALL, make_planner

@@ -20,8 +20,8 @@ from ibrobot_planning.planner import PoseGoal, PositionGoal
 from ibrobot_planning.planners.linear import linear_path
 from ibrobot_planning.tasks.runner import RUN
 
-from ibrobot_core.api import IbrobotError, PlanningError, Pose, Quaternion, Vector3
-from ibrobot_core.app import ConfigError, PlanCode, Runtime
+from ibrobot_core.api import IbrobotError, PlanCode, PlanningError, Pose, Quaternion, Vector3
+from ibrobot_core.app import ConfigError, Runtime
 
 from .conftest import Make
 from .table_arm import make_robot

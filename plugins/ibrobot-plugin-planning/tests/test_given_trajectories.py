@@ -21,8 +21,18 @@ from ibrobot_planning.planners.completion import MOST_POINTS, Start, completed
 from ibrobot_planning.planners.timing import LONGEST_S
 from ibrobot_planning.suite import FakePlanner
 
-from ibrobot_core.api import Header, Joint, JointTrajectory, JointTrajectoryPoint, PlanningError, Robot, Vector, ns
-from ibrobot_core.app import PlanCode, Runtime, Spline
+from ibrobot_core.api import (
+    Header,
+    Joint,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    PlanCode,
+    PlanningError,
+    Robot,
+    Vector,
+    ns,
+)
+from ibrobot_core.app import Runtime, Spline
 
 from .conftest import Make
 from .table_arm import ARM, WALL, make_planner

@@ -9,8 +9,7 @@ import pytest
 from ibrobot_planning.goals.text import target
 from ibrobot_planning.planner import AnyGoal, JointGoal, NamedGoal, PoseGoal, PositionGoal
 
-from ibrobot_core.api import PlanningError, Quaternion, Vector3
-from ibrobot_core.app import PlanCode
+from ibrobot_core.api import PlanCode, PlanningError, Quaternion, Vector3
 
 from .table_arm import JOINTS, make_robot
 

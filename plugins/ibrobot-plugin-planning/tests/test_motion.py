@@ -32,6 +32,7 @@ from ibrobot_core.api import (
     Header,
     JointState,
     NotSupported,
+    PlanCode,
     PlanningError,
     Pose,
     PoseStamped,
@@ -41,7 +42,7 @@ from ibrobot_core.api import (
     Vector,
     Vector3,
 )
-from ibrobot_core.app import PlanCode, RequestError, Runtime
+from ibrobot_core.app import RequestError, Runtime
 
 from .conftest import Make
 from .table_arm import JOINTS, make_robot

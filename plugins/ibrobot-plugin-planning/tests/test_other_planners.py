@@ -20,8 +20,8 @@ from ibrobot_planning.suite import PlannerSuite
 from ibrobot_testing.command import command_line
 from ibrobot_testing.site import made_up_site
 
-from ibrobot_core.api import Context, PlanningError
-from ibrobot_core.app import ConfigError, LaunchRequest, PlanCode, Runtime, Session, installed_plugins, load_config
+from ibrobot_core.api import Context, PlanCode, PlanningError
+from ibrobot_core.app import ConfigError, LaunchRequest, Runtime, Session, installed_plugins, load_config
 
 from .other_planners import BatchOptions, BatchPlanner
 from .table_arm import ARM, make_robot

@@ -34,8 +34,7 @@ from ibrobot_planning.planners.rrt import RrtConnectPlanner
 from ibrobot_planning.planners.timing import Motion, motion_of, timed
 from ibrobot_planning.world.objects import Sphere, World, WorldObject
 
-from ibrobot_core.api import PlanningError, Pose, Robot, Vector, Vector3
-from ibrobot_core.app import PlanCode
+from ibrobot_core.api import PlanCode, PlanningError, Pose, Robot, Vector, Vector3
 
 from .table_arm import ARM, WALL, box, make_planner, make_robot, write_arm
 

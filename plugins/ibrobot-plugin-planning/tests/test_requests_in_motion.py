@@ -18,8 +18,8 @@ from ibrobot_planning.execution.source import GO_TO, MOVE_TO_CONFIGURATION, MOVE
 from ibrobot_planning.suite import FakePlanner
 from ibrobot_planning.world.objects import SNAPSHOT, World
 
-from ibrobot_core.api import HardwareError, IbrobotError, PlanningError
-from ibrobot_core.app import ConfigError, PlanCode, RequestError, Runtime, Service
+from ibrobot_core.api import HardwareError, IbrobotError, PlanCode, PlanningError
+from ibrobot_core.app import ConfigError, RequestError, Runtime, Service
 
 from .conftest import Make
 from .table_arm import ARM, JOINTS

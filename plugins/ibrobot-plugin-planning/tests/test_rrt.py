@@ -27,8 +27,7 @@ from ibrobot_planning.planners.timing import Motion
 from ibrobot_planning.world.collision import Collisions
 from ibrobot_planning.world.objects import Sphere, World, WorldObject
 
-from ibrobot_core.api import PlanningError, Pose, Quaternion, Robot, Vector3
-from ibrobot_core.app import PlanCode
+from ibrobot_core.api import PlanCode, PlanningError, Pose, Quaternion, Robot, Vector3
 
 from .table_arm import ARM, WALL, box, make_planner, make_robot, write_arm
 

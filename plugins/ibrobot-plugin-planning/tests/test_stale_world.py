@@ -33,6 +33,7 @@ from ibrobot_core.api import (
     Float64MultiArray,
     Header,
     Message,
+    PlanCode,
     PlanningError,
     PointCloud2,
     PointField,
@@ -44,7 +45,7 @@ from ibrobot_core.api import (
     Vector3,
     ns,
 )
-from ibrobot_core.app import ConfigError, PlanCode, Session, single_options
+from ibrobot_core.app import ConfigError, Session, single_options
 
 from .table_arm import ARM, make_robot
 from .test_clouds import CLOUD, FIELDS, INFO, MOUNTS, cloud, depth_image

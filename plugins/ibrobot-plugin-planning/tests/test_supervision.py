@@ -16,8 +16,8 @@ from ibrobot_planning.world.arm import robot_arm
 from ibrobot_planning.world.collision import Collisions
 from ibrobot_planning.world.objects import SNAPSHOT
 
-from ibrobot_core.api import HardwareError, Vector
-from ibrobot_core.app import PlanCode, Runtime
+from ibrobot_core.api import HardwareError, PlanCode, Vector
+from ibrobot_core.app import Runtime
 
 from .conftest import Make
 from .table_arm import JOINTS

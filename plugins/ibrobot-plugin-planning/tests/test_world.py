@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from ibrobot_planning.world.objects import Box, Capsule, Cylinder, Mesh, Sphere, Voxels, World, WorldObject, read_mesh
 
-from ibrobot_core.api import PlanningError, Pose, Quaternion, Vector3
-from ibrobot_core.app import PlanCode
+from ibrobot_core.api import PlanCode, PlanningError, Pose, Quaternion, Vector3
 
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]])
 ONE = np.array([[0, 1, 2]])

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Context, Frame, Policy, PolicyError, PolicySpec, Tensors, did_you_mean
-from ibrobot_core.app import check_tensors
 from ibrobot_policy_servers.connection import Connection
 from ibrobot_policy_servers.options import ActionMap, ObservationMap, ServerOptions
 
@@ -143,7 +142,7 @@ class ServedPolicy(Policy):
 
     def _request(self, tensors: Tensors, timeout_s: float) -> Tensors:
         """One request; any error closes the connection."""
-        check_tensors(tensors, self._expected, others=True)
+        self.check_tensors(tensors, self._expected, others=True)
         request: dict[str, Any] = {}
         for each in self._options.observations:
             _put(request, each.key, tensors[each.observation])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import logging
 import queue
@@ -18,7 +19,7 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import NS_PER_S, IbrobotError, Payload, PictureCodec, Policy, PolicyError, Tensors, Transport
-from ibrobot_core.app import WireError, check_finite, copied_tensors
+from ibrobot_core.app import WireError, check_finite
 from ibrobot_serve.fair_queue import FairQueue
 from ibrobot_serve.pacing import Pacing
 from ibrobot_serve.results import Results
@@ -405,7 +406,7 @@ class InferenceService:
         try:
             # Other threads encode the answers, while the model may overwrite its outputs in the next batch.
             requests = [ticket.message.tensors for ticket in live]
-            outputs = [copied_tensors(each) for each in self._policy.infer_batch(requests)]
+            outputs = [copy.deepcopy(each) for each in self._policy.infer_batch(requests)]
             if len(outputs) != len(live):
                 raise PolicyError(f"{len(outputs)} outputs for a batch of {len(live)}")
         except Exception as error:  # noqa: BLE001 - contained: the request is refused

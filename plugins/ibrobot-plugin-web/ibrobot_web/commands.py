@@ -13,7 +13,6 @@ import attrs
 
 from ibrobot_core.api import IbrobotError, PlanningError, seconds
 from ibrobot_core.app import (
-    PULSE_S,
     Pulse,
     RunView,
     error_text,
@@ -113,7 +112,7 @@ class Commands:
         while True:
             self._pulse.beat()
             try:
-                numbers = [self._stops.get(timeout=PULSE_S), *_waiting(self._stops)]
+                numbers = [self._stops.get(timeout=Pulse.period_s), *_waiting(self._stops)]
             except queue.Empty:
                 continue
             if stops := [number for number in numbers if number not in (None, _TRIAL)]:

@@ -17,7 +17,6 @@ from ibrobot_webxr.shared import close_page, open_page
 from ibrobot_webxr.teleop import WebxrTeleop
 
 from ibrobot_core.api import Context, Description, Joint, JointReading, Robot, SteppedClock, TeleopCommand, Vector, ns
-from ibrobot_core.app import begin_operation, operate
 
 from .conftest import AXES
 
@@ -75,7 +74,7 @@ class Rig:
         self.ctx = host_context("hand", robot=robot_of(self.mjcf), clock=SteppedClock(ns(1000.0)))
         self.teleop = WebxrTeleop(self.options, self.ctx)
         self.teleop.connect()
-        begin_operation(self.teleop, self.measured())
+        self.teleop.begin_operation(self.measured())
 
     def measured(self) -> JointReading:
         return JointReading(self.ctx.clock.now_ns(), self.position + self.sag, np.zeros(6), np.zeros(6))
@@ -101,7 +100,7 @@ class Rig:
             if self.connected and self._count % FRAME == 0:
                 self.send()
             self._count += 1
-            self.last = operate(self.teleop, self.measured())
+            self.last = self.teleop.operate(self.measured())
             if self.last.positions is not None:
                 self.setpoint = np.array([self.last.positions[name] for name in AXES])
                 self.position = self.setpoint

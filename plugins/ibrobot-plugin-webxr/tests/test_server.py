@@ -36,7 +36,7 @@ from ibrobot_core.api import (
     TeleopError,
     ns,
 )
-from ibrobot_core.app import Bus, operate
+from ibrobot_core.app import Bus
 
 from .browser import Browser, hand, hands
 from .rig import ANY_PORT, BENT, page_of, robot_of
@@ -158,7 +158,7 @@ def test_a_page_that_disappears_holds_the_robot(ctx: Context, teleop: WebxrTeleo
     assert teleop.read(measured(ctx)).positions is not None
     gone_s = time.monotonic()
     browser.disconnect()
-    while operate(teleop, later(ctx)).positions is not None:
+    while teleop.operate(later(ctx)).positions is not None:
         assert time.monotonic() - gone_s < 5
         time.sleep(0.002)
 
@@ -197,8 +197,8 @@ def test_a_silent_page_loses_control(
     browser.log_in().connect()
     engage(browser, teleop, ctx)
     assert browser.state(control="free")
-    operate(teleop, later(ctx))
-    assert operate(teleop, later(ctx)).positions is None
+    teleop.operate(later(ctx))
+    assert teleop.operate(later(ctx)).positions is None
     browser.send({"type": "claim"})
     assert browser.state(control="you")
 

@@ -19,7 +19,6 @@ from ibrobot_webxr.options import WebxrOptions
 from ibrobot_webxr.teleop import WebxrTeleop
 
 from ibrobot_core.api import Context, Teleop, TeleopCommand, TeleopError
-from ibrobot_core.app import begin_operation
 
 from .rig import ANY_PORT, TICK_S, UPRIGHT, Rig, page_of, robot_of
 
@@ -246,7 +245,7 @@ def test_a_clutch_held_before_the_mode_begins_counts_as_released(start: Start):
     assert rig.last.positions is None
     rig.press()
     assert rig.last.positions is not None
-    begin_operation(rig.teleop, rig.measured())
+    rig.teleop.begin_operation(rig.measured())
     assert rig.tick(20).positions is None
 
 

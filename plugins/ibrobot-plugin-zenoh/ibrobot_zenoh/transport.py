@@ -12,7 +12,6 @@ from ibrobot_ros2.interfaces import ServiceType
 from ibrobot_ros2.workers import StopWay, Workers
 
 from ibrobot_core.api import Context, Handler, Payload, TransportError
-from ibrobot_core.app import HANDLER_THREADS
 from ibrobot_zenoh.access import ANYBODY, SERVED, SERVICES, TOPICS
 from ibrobot_zenoh.connection import first_line
 from ibrobot_zenoh.network import RosHandler, Urgent, UrgentHandler
@@ -101,7 +100,7 @@ class ZenohTransport(RosTransport):
         return self._keep(self.connection.declare(lambda session: session.declare_subscriber(key, take)), subscriber)
 
     @override
-    def serve(self, name: str, handler: Handler, *, workers: int = HANDLER_THREADS) -> Callable[[], None]:
+    def serve(self, name: str, handler: Handler, *, workers: int = RosTransport.handler_threads) -> Callable[[], None]:
         server = self._workers_of(name, lambda request, sender, sent_ns: handler(request, sender), workers)
         limit = self.options.max_message_size
 
@@ -125,7 +124,7 @@ class ZenohTransport(RosTransport):
 
         # A long queue: urgent requests must not be dropped.
         urgent = Workers(answer_or_raise, f"the urgent requests of {name}", _URGENT_WORKERS, URGENT_WAITING, way)
-        server = self._workers_of(name, handler, HANDLER_THREADS)
+        server = self._workers_of(name, handler, self.handler_threads)
 
         def take(query: Query) -> None:
             try:

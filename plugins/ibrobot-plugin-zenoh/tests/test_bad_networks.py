@@ -216,7 +216,7 @@ def test_a_request_that_cannot_be_read_ends_the_run():
 
 def test_urgent_requests_wait_for_no_others(monkeypatch: pytest.MonkeyPatch):
     """A stop is answered while a flood keeps every thread busy and fills the queue."""
-    monkeypatch.setattr(transport_module, "HANDLER_THREADS", 2)
+    monkeypatch.setattr(transport_module.ZenohTransport, "handler_threads", 2)
     monkeypatch.setattr(transport_module, "REQUESTS_WAITING", 2)
     endpoint = free_endpoint()
     server, robot = router(endpoint), client(endpoint)

@@ -27,10 +27,11 @@ from ibrobot_core.api import (
     JointTrajectory,
     JointTrajectoryPoint,
     MoveJoint,
+    PlanCode,
     PlanningError,
     seconds,
 )
-from ibrobot_core.app import ControlState, ExecutorConfig, GoalRun, PlanCode
+from ibrobot_core.app import ControlState, ExecutorConfig, GoalRun
 from ibrobot_ros2.calls import Calls, GoalRequest, Wire
 from ibrobot_ros2.inference import serve_chunks
 from ibrobot_ros2.offers import time_of, with_ns

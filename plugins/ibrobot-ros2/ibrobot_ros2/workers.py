@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from ibrobot_core.api import TransportError
-from ibrobot_core.app import PULSE_S, Pulse, RunView, as_failure
+from ibrobot_core.app import Pulse, RunView
 
 _END_S = 1.0
 _STOP_BLOCKED_S = 6.0
@@ -46,7 +46,7 @@ class StopWay:
             with suppress(Exception):  # the end of the run stops the robot, too
                 self._session.emergency_stop()
         finally:
-            self._session.fail(self._pulse.name, as_failure(error))
+            self._session.fail(self._pulse.name, error)
 
 
 class Workers[T]:
@@ -147,7 +147,7 @@ class Workers[T]:
                 while not (self._ended or self._waiting):
                     if self._way is not None:
                         self._way.beat()
-                    self._arrived.wait(None if self._way is None else PULSE_S)
+                    self._arrived.wait(None if self._way is None else Pulse.period_s)
             finally:
                 self._idle -= 1
             return None if self._ended else self._waiting.popleft()

@@ -22,8 +22,7 @@ from ibrobot_ros2.services import (
     plain,
 )
 
-from ibrobot_core.api import Header, JointState
-from ibrobot_core.app import PlanCode
+from ibrobot_core.api import Header, JointState, PlanCode
 
 PLAIN = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from ibrobot_core.api import Descriptor, Late, hookimpl
-from ibrobot_core.app import Kind, TerminalDescriptor
+from ibrobot_core.app import Kind
 from ibrobot_terminal.guide import GuideDescriptor, PanelDescriptor
 
 
@@ -18,9 +18,9 @@ def ibrobot_kinds() -> Iterable[Kind]:
 
 
 @hookimpl
-def ibrobot_terminals() -> Iterable[TerminalDescriptor]:
+def ibrobot_terminals() -> Iterable[Descriptor[Any]]:
     """Keys and panel."""
-    yield TerminalDescriptor(
+    yield Descriptor(
         type="panel",
         make=lambda options, ctx: Late("ibrobot_terminal.run_terminal:PanelTerminal")(),
         summary="reads the terminal's keys, and shows a live panel",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 from ibrobot_core.api import Context, Engine, Frame, ModelContext, Policy, PolicyError, Tensors, ns
-from ibrobot_core.app import RobotConfig, copied_tensors
+from ibrobot_core.app import RobotConfig
 from ibrobot_testing.contexts import host_context
 from ibrobot_testing.fakes import FakePolicy
 from ibrobot_testing.suite import Suite
@@ -73,7 +74,7 @@ class EngineSuite(Suite[Engine]):
         with self.started() as (engine, twin):
             for seed in range(3):
                 tensors = self.tensors(twin, seed)
-                before = copied_tensors(tensors)
+                before = copy.deepcopy(tensors)
                 _check_equal(self._ask(engine, tensors, seed + 1), twin.infer(tensors))
                 _check_equal(tensors, before)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import ClassVar
@@ -12,7 +13,6 @@ import pytest
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Context, Frame, Policy, PolicyError, PolicySpec, Tensors
-from ibrobot_core.app import copied_tensors
 from ibrobot_testing.suite import Suite
 
 _STEP_NS = 33_333_333
@@ -185,13 +185,13 @@ class PolicySuite(Suite[Policy]):
         """No step changes its input."""
         with self.loaded() as (policy, ctx):
             frame = self.frame(policy, ctx, 1)
-            before = copied_tensors(frame.values)
+            before = copy.deepcopy(frame.values)
             inputs = policy.preprocess(frame)
             assert _equal(frame.values, before), "preprocess changed the frame"
-            before = copied_tensors(inputs)
+            before = copy.deepcopy(inputs)
             outputs = policy.infer(inputs)
             assert _equal(inputs, before), "infer changed its input"
-            before = copied_tensors(outputs)
+            before = copy.deepcopy(outputs)
             policy.postprocess(outputs)
             assert _equal(outputs, before), "postprocess changed its input"
 
@@ -207,9 +207,9 @@ class PolicySuite(Suite[Policy]):
         """What `preprocess` and `infer` returned does not change with the next request: requests overlap."""
         with self.loaded() as (policy, ctx):
             inputs = policy.preprocess(self.frame(policy, ctx, 1))
-            inputs_before = copied_tensors(inputs)
+            inputs_before = copy.deepcopy(inputs)
             outputs = policy.infer(inputs)
-            outputs_before = copied_tensors(outputs)
+            outputs_before = copy.deepcopy(outputs)
             policy.infer(policy.preprocess(self.frame(policy, ctx, 2)))
             assert _equal(inputs, inputs_before), "preprocess uses its output again"
             assert _equal(outputs, outputs_before), "infer uses its output again"
@@ -239,7 +239,7 @@ class PolicySuite(Suite[Policy]):
             if policy.spec.stateful:
                 pytest.skip("each request changes what it remembers")
             batch = [policy.preprocess(self.frame(policy, ctx, i)) for i in range(3)]
-            together = [copied_tensors(outputs) for outputs in policy.infer_batch(batch)]
+            together = [copy.deepcopy(outputs) for outputs in policy.infer_batch(batch)]
             assert len(together) == len(batch)
             for inputs, outputs in zip(batch, together, strict=True):
                 alone = policy.postprocess(policy.infer(inputs)).copy()
@@ -279,7 +279,7 @@ class PolicySuite(Suite[Policy]):
             if policy.spec.stateful:
                 pytest.skip("says that it remembers")
             inputs = policy.preprocess(self.frame(policy, ctx, 1))
-            first = copied_tensors(policy.infer(inputs))
+            first = copy.deepcopy(policy.infer(inputs))
             policy.infer(policy.preprocess(self.frame(policy, ctx, 2)))
             assert _equal(first, policy.infer(inputs))
 

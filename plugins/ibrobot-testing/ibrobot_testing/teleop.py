@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from ibrobot_core.api import Context, JointReading, OperatorEvent, Teleop, TeleopCommand, TeleopError, Vector, ns
-from ibrobot_core.app import HOLD_S, begin_operation, operate
 from ibrobot_testing.suite import Suite
 
 
@@ -46,7 +45,7 @@ class TeleopSuite(Suite[Teleop]):
 
     def operate(self, teleop: Teleop) -> None:
         """The operator, with the deadman pressed, commands motion."""
-        raise NotImplementedError(f"{type(self).__name__} must define operate(self, teleop)")
+        raise NotImplementedError(f"{type(self).__name__} must define self.operate(teleop)")
 
     def hold(self, teleop: Teleop) -> None:
         """One period in which the operator keeps the deadman pressed and commands motion, and the device reports it.
@@ -80,15 +79,15 @@ class TeleopSuite(Suite[Teleop]):
         return JointReading(ctx.clock.now_ns(), position.copy(), np.zeros_like(position), np.zeros_like(position))
 
     def _begin(self, teleop: Teleop, ctx: Context, position: Vector) -> TeleopCommand:
-        begin_operation(teleop, self._measure(ctx, position))
+        teleop.begin_operation(self._measure(ctx, position))
         return self._press(teleop, ctx, position)
 
     def _press(self, teleop: Teleop, ctx: Context, position: Vector) -> TeleopCommand:
         if self.has_operator:
             self.rest(teleop)
-            operate(teleop, self._measure(ctx, position))
+            teleop.operate(self._measure(ctx, position))
         self.engage(teleop)
-        return operate(teleop, self._measure(ctx, position))
+        return teleop.operate(self._measure(ctx, position))
 
     def test_begins_where_the_robot_is(self) -> None:
         """The first positions after each `activate` are the measured ones."""
@@ -104,7 +103,7 @@ class TeleopSuite(Suite[Teleop]):
             pose = self.poses(ctx)[0]
             commands = [self._begin(teleop, ctx, pose)]
             self.operate(teleop)
-            commands += [operate(teleop, self._measure(ctx, pose)) for _ in range(10)]
+            commands += [teleop.operate(self._measure(ctx, pose)) for _ in range(10)]
             for command in commands:
                 for joint, position in (command.positions or {}).items():
                     assert joint in ctx.robot.joint_names, f"{joint!r} is not a joint of this robot"
@@ -117,7 +116,7 @@ class TeleopSuite(Suite[Teleop]):
             first = self._begin(teleop, ctx, pose).positions or {}
             self.operate(teleop)
             for _ in range(100):
-                positions = operate(teleop, self._measure(ctx, pose)).positions or {}
+                positions = teleop.operate(self._measure(ctx, pose)).positions or {}
                 if any(abs(positions[j] - first.get(j, positions[j])) > self.tolerance_rad for j in positions):
                     return
             pytest.fail("the operator asked for motion and none came")
@@ -128,11 +127,11 @@ class TeleopSuite(Suite[Teleop]):
             pytest.skip("has no deadman")
         with self.connected() as (teleop, ctx):
             pose = self.poses(ctx)[0]
-            begin_operation(teleop, self._measure(ctx, pose))
-            assert operate(teleop, self._measure(ctx, pose)).positions is None
+            teleop.begin_operation(self._measure(ctx, pose))
+            assert teleop.operate(self._measure(ctx, pose)).positions is None
             assert self._press(teleop, ctx, pose).positions is not None
             self.release(teleop)
-            commands = [operate(teleop, self._measure(ctx, pose)) for _ in range(2)]
+            commands = [teleop.operate(self._measure(ctx, pose)) for _ in range(2)]
             assert commands[-1].positions is None
 
     def test_waits_for_the_operator(self) -> None:
@@ -142,13 +141,13 @@ class TeleopSuite(Suite[Teleop]):
         with self.connected() as (teleop, ctx):
             pose = self.poses(ctx)[0]
             for _ in range(2):
-                begin_operation(teleop, self._measure(ctx, pose))
+                teleop.begin_operation(self._measure(ctx, pose))
                 for _ in range(100):
-                    positions = operate(teleop, self._measure(ctx, pose)).positions
+                    positions = teleop.operate(self._measure(ctx, pose)).positions
                     assert positions is None, "it commands positions before the operator has acted"
                 self._press(teleop, ctx, pose)
                 self.operate(teleop)
-                assert operate(teleop, self._measure(ctx, pose)).positions, "no positions once the operator acted"
+                assert teleop.operate(self._measure(ctx, pose)).positions, "no positions once the operator acted"
 
     @contextmanager
     def _moving(self) -> Iterator[tuple[Teleop, Context, Vector]]:
@@ -160,14 +159,14 @@ class TeleopSuite(Suite[Teleop]):
             self._begin(teleop, ctx, pose)
             for _ in range(5):
                 self.hold(teleop)
-                assert operate(teleop, self._measure(ctx, pose)).positions, "no positions with the deadman pressed"
+                assert teleop.operate(self._measure(ctx, pose)).positions, "no positions with the deadman pressed"
             yield teleop, ctx, pose
 
     def _needs_a_new_press(self, teleop: Teleop, ctx: Context, pose: Vector) -> None:
         """Check that the held deadman moves nothing, and a new press does."""
         for _ in range(100):
             self.hold(teleop)
-            positions = operate(teleop, self._measure(ctx, pose)).positions
+            positions = teleop.operate(self._measure(ctx, pose)).positions
             assert positions is None, "it moves again by the same press of the deadman"
         command = self._press(teleop, ctx, pose)
         assert command.positions, "a new press moves nothing"
@@ -176,19 +175,19 @@ class TeleopSuite(Suite[Teleop]):
     def test_a_held_deadman_does_not_survive_an_activation(self) -> None:
         """A deadman held over a stop, a reset, a mode switch or a change of control must be pressed again."""
         with self._moving() as (teleop, ctx, pose):
-            begin_operation(teleop, self._measure(ctx, pose))
+            teleop.begin_operation(self._measure(ctx, pose))
             self._needs_a_new_press(teleop, ctx, pose)
 
     def test_silence_ends_motion(self) -> None:
-        """Without reports motion ends within `HOLD_S`, and needs a new press of the deadman when they come again."""
+        """Without reports motion ends within `hold_s`, and needs a new press of the deadman when they come again."""
         with self._moving() as (teleop, ctx, pose):
             begun_ns = ctx.clock.now_ns()
             self.freeze(teleop)
             try:
-                while operate(teleop, self._measure(ctx, pose)).positions is not None:
-                    assert ctx.clock.now_ns() - begun_ns <= ns(HOLD_S), "a silent device moves the robot"
+                while teleop.operate(self._measure(ctx, pose)).positions is not None:
+                    assert ctx.clock.now_ns() - begun_ns <= ns(teleop.deadman.hold_s), "a silent device moves the robot"
                 for _ in range(20):
-                    assert operate(teleop, self._measure(ctx, pose)).positions is None, "it moves again by itself"
+                    assert teleop.operate(self._measure(ctx, pose)).positions is None, "it moves again by itself"
             except TeleopError:
                 return  # a fault, until a reset activates it
             self._needs_a_new_press(teleop, ctx, pose)
@@ -199,7 +198,7 @@ class TeleopSuite(Suite[Teleop]):
             self.hold(teleop)
             ctx.clock.sleep_until(ctx.clock.now_ns() + ns(2.0))
             try:
-                assert operate(teleop, self._measure(ctx, pose)).positions is None, "it goes on after a pause"
+                assert teleop.operate(self._measure(ctx, pose)).positions is None, "it goes on after a pause"
             except TeleopError:
                 return
             self._needs_a_new_press(teleop, ctx, pose)
@@ -210,11 +209,11 @@ class TeleopSuite(Suite[Teleop]):
             pytest.skip("has no buttons")
         with self.connected() as (teleop, ctx):
             pose = self.poses(ctx)[0]
-            begin_operation(teleop, self._measure(ctx, pose))
-            assert list(operate(teleop, self._measure(ctx, pose)).events) == [], "an event before any button"
+            teleop.begin_operation(self._measure(ctx, pose))
+            assert list(teleop.operate(self._measure(ctx, pose)).events) == [], "an event before any button"
             for event in (*self.events, *self.events):
                 self.press(teleop, event)
-                events = [each for _ in range(3) for each in operate(teleop, self._measure(ctx, pose)).events]
+                events = [each for _ in range(3) for each in teleop.operate(self._measure(ctx, pose)).events]
                 assert events == [event]
 
     def test_approach_arrives(self) -> None:
@@ -229,17 +228,17 @@ class TeleopSuite(Suite[Teleop]):
         with self.connected() as (teleop, ctx):
             pose = self.poses(ctx)[0]
             begin = self._measure(ctx, pose)
-            begin_operation(teleop, begin)
+            teleop.begin_operation(begin)
             np.testing.assert_array_equal(begin.position, pose)
             begin.position[:] = 0.0
             self.rest(teleop)
             if self.has_operator:
                 before = self._measure(ctx, pose)
-                operate(teleop, before)
+                teleop.operate(before)
                 before.position[:] = 0.0
             self.engage(teleop)
             now = self._measure(ctx, pose)
-            command = operate(teleop, now)
+            command = teleop.operate(now)
             np.testing.assert_array_equal(now.position, pose)
             _check_near(command, ctx, pose, self.tolerance_rad)
 
@@ -256,7 +255,7 @@ class TeleopSuite(Suite[Teleop]):
         with self.connected() as (teleop, ctx):
             pass
         with pytest.raises(TeleopError):
-            operate(teleop, self._measure(ctx, self.poses(ctx)[0]))
+            teleop.operate(self._measure(ctx, self.poses(ctx)[0]))
 
 
 def _check_near(command: TeleopCommand, ctx: Context, pose: Vector, most_rad: float) -> None:

@@ -21,13 +21,14 @@ from ibrobot_core.api import (
     IbrobotError,
     JointTrajectory,
     MoveJoint,
+    PlanCode,
     PlanningError,
     SlowDown,
     Vector,
     ns,
     seconds,
 )
-from ibrobot_core.app import ControlState, GuardedRun, PlanCode, RunView, SessionWorker
+from ibrobot_core.app import ControlState, GuardedRun, RunView, SessionWorker
 from ibrobot_planning.planners.completion import Start, check_size, completed
 from ibrobot_planning.planners.options import GoalCheckOptions, RrtConnectOptions
 from ibrobot_planning.planners.timing import Motion, motion_of

@@ -17,11 +17,12 @@ from ibrobot_core.api import (
     IbrobotError,
     JointTrajectory,
     MoveJoint,
+    PlanCode,
     PlanningError,
     Vector,
     ns,
 )
-from ibrobot_core.app import ControlMode, PlanCode, Plugins, RobotConfig, RunView
+from ibrobot_core.app import ControlMode, Plugins, RobotConfig, RunView
 from ibrobot_planning.execution.motions import commanded
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.grammar import GoalOptions

@@ -13,13 +13,13 @@ from ibrobot_core.api import (
     JointState,
     JointTrajectory,
     JointTrajectoryPoint,
+    PlanCode,
     Pose,
     PoseStamped,
     Vector,
     documented,
     option,
 )
-from ibrobot_core.app import PlanCode
 from ibrobot_planning.goals.grammar import LEAST_SCALING, GoalOptions, check_waypoints
 from ibrobot_planning.goals.text import Target
 from ibrobot_planning.planner import Goal

@@ -8,8 +8,8 @@ from weakref import WeakKeyDictionary
 
 import attrs
 
-from ibrobot_core.api import PlanningError
-from ibrobot_core.app import PlanCode, RunView
+from ibrobot_core.api import PlanCode, PlanningError
+from ibrobot_core.app import RunView
 
 type Outcome = Literal["SUCCEEDED", "REJECTED", "PLANNING_FAILED", "EXECUTION_FAILED", "CANCELLED"]
 

@@ -11,8 +11,8 @@ import attrs
 import numpy as np
 from ibrobot_kinematics import ToolConstraints
 
-from ibrobot_core.api import Header, IbrobotError, JointState, PlanningError, PoseStamped, Vector
-from ibrobot_core.app import ControlMode, NoRequest, PlanCode, RunView, Service
+from ibrobot_core.api import Header, IbrobotError, JointState, PlanCode, PlanningError, PoseStamped, Vector
+from ibrobot_core.app import ControlMode, NoRequest, RunView, Service
 from ibrobot_planning.execution.motions import commanded
 from ibrobot_planning.execution.plans import GoalPlans, arm_joints
 from ibrobot_planning.execution.requests import (

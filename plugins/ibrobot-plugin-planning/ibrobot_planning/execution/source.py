@@ -12,13 +12,22 @@ from typing import Any, override
 import attrs
 import numpy as np
 
-from ibrobot_core.api import HardwareError, NotSupported, PlanningError, Pose, PoseStamped, String, ns, seconds
+from ibrobot_core.api import (
+    HardwareError,
+    NotSupported,
+    PlanCode,
+    PlanningError,
+    Pose,
+    PoseStamped,
+    String,
+    ns,
+    seconds,
+)
 from ibrobot_core.app import (
     ControlMode,
     ControlState,
     GoalRun,
     NoRequest,
-    PlanCode,
     Received,
     RequestLimits,
     Service,

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from ibrobot_core.api import PlanningError
-from ibrobot_core.app import PlanCode
+from ibrobot_core.api import PlanCode, PlanningError
 
 
 def invalid_goal(message: str) -> PlanningError:

@@ -13,8 +13,7 @@ from ibrobot_kinematics.poses import homogeneous, matrix, pose
 from ibrobot_kinematics.rotations import from_quaternion, from_rpy
 from ibrobot_kinematics.run_frames import BASE_FRAMES
 
-from ibrobot_core.api import PlanningError, Pose, Vector, Vector3, documented, option
-from ibrobot_core.app import PlanCode
+from ibrobot_core.api import PlanCode, PlanningError, Pose, Vector, Vector3, documented, option
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.planner import (
     ConstrainedGoal,

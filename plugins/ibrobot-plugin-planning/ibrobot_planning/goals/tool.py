@@ -21,8 +21,7 @@ from ibrobot_kinematics.poses import matrix
 from ibrobot_kinematics.rotations import between, cross, log
 from ibrobot_kinematics.search import TABLE_LEVER_M, search, starts_from_table
 
-from ibrobot_core.api import PlanningError, Vector, Vector3
-from ibrobot_core.app import PlanCode
+from ibrobot_core.api import PlanCode, PlanningError, Vector, Vector3
 from ibrobot_planning.goals.errors import invalid_goal, unreachable
 from ibrobot_planning.planner import Goal, PoseGoal, PositionGoal
 

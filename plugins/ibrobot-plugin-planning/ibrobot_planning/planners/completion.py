@@ -18,8 +18,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.api import JointTrajectory, PlanningError, Robot, Vector, ns, seconds
-from ibrobot_core.app import PlanCode
+from ibrobot_core.api import JointTrajectory, PlanCode, PlanningError, Robot, Vector, ns, seconds
 from ibrobot_planning.planners.timing import LONGEST_S, Motion, evaluated, motion_of, quintics, trajectory_of
 
 START_RAD = 0.01

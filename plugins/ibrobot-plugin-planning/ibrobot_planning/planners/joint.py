@@ -9,8 +9,16 @@ from typing import override
 
 import numpy as np
 
-from ibrobot_core.api import Context, Header, JointTrajectory, JointTrajectoryPoint, PlanningError, ns, seconds
-from ibrobot_core.app import PlanCode
+from ibrobot_core.api import (
+    Context,
+    Header,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    PlanCode,
+    PlanningError,
+    ns,
+    seconds,
+)
 from ibrobot_planning.goals.joints import checked_start, joint_target
 from ibrobot_planning.planner import JointGoal, NamedGoal, Planner, PlanRequest, PlanResult
 from ibrobot_planning.planners.options import JointPlannerOptions

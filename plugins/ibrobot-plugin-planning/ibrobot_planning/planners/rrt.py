@@ -11,8 +11,7 @@ import attrs
 import numpy as np
 from ibrobot_kinematics import ToolConstraints, robot_model
 
-from ibrobot_core.api import Context, JointTrajectory, PlanningError, Vector
-from ibrobot_core.app import PlanCode
+from ibrobot_core.api import Context, JointTrajectory, PlanCode, PlanningError, Vector
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.joints import checked_start, joint_target
 from ibrobot_planning.goals.tool import Candidate, Tool

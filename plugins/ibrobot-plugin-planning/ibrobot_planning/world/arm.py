@@ -16,8 +16,7 @@ import numpy as np
 from ibrobot_kinematics.errors import KinematicsError
 from ibrobot_kinematics.mjcf import Mjcf, placement, read_mjcf, several_arms
 
-from ibrobot_core.api import PlanningError, Robot, Vector
-from ibrobot_core.app import PlanCode
+from ibrobot_core.api import PlanCode, PlanningError, Robot, Vector
 from ibrobot_planning.world.coal_shapes import convex, geometry
 from ibrobot_planning.world.objects import Box, Capsule, Cylinder, Plane, Shape, Sphere
 

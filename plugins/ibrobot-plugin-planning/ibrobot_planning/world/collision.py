@@ -13,8 +13,7 @@ import numpy as np
 import pinocchio
 from ibrobot_kinematics.poses import matrix
 
-from ibrobot_core.api import PlanningError, Vector
-from ibrobot_core.app import PlanCode
+from ibrobot_core.api import PlanCode, PlanningError, Vector
 from ibrobot_planning.world.arm import ADJACENT, ALWAYS, NEVER, Arm, LinkShape, Pair, reach, sorted_pair
 from ibrobot_planning.world.coal_shapes import boxes, geometry
 from ibrobot_planning.world.objects import Boxes, World

@@ -14,8 +14,8 @@ import attrs
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ibrobot_core.api import PlanningError, Pose, Vector
-from ibrobot_core.app import Bus, NoRequest, PlanCode, Service
+from ibrobot_core.api import PlanCode, PlanningError, Pose, Vector
+from ibrobot_core.app import Bus, NoRequest, Service
 from ibrobot_planning.world.ages import AgeSummary
 from ibrobot_planning.world.options import FURTHEST
 

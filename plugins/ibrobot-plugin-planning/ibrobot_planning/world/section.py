@@ -15,6 +15,7 @@ from ibrobot_kinematics.poses import matrix, pose, pose_at
 
 from ibrobot_core.api import (
     Float64MultiArray,
+    PlanCode,
     PlanningError,
     Pose,
     Quaternion,
@@ -24,7 +25,7 @@ from ibrobot_core.api import (
     did_you_mean,
     resolve_path,
 )
-from ibrobot_core.app import Component, NoRequest, PlanCode, RobotConfig, RunView, Service, Subscription
+from ibrobot_core.app import Component, NoRequest, RobotConfig, RunView, Service, Subscription
 from ibrobot_planning.world.ages import Age, Limit, Unusable
 from ibrobot_planning.world.hands import hands
 from ibrobot_planning.world.objects import (

@@ -13,7 +13,6 @@ from typing import Any, override
 import attrs
 
 from ibrobot_core.api import Handler, Payload, Transport, TransportError
-from ibrobot_core.app import HANDLER_THREADS
 
 
 @attrs.frozen(eq=False)
@@ -79,7 +78,7 @@ class FakeTransport(Transport):
         return lambda: self._leave(self._subscribers, topic, subscriber)
 
     @override
-    def serve(self, name: str, handler: Handler, *, workers: int = HANDLER_THREADS) -> Callable[[], None]:
+    def serve(self, name: str, handler: Handler, *, workers: int = Transport.handler_threads) -> Callable[[], None]:
         server = _Server(handler, ThreadPoolExecutor(workers, f"the server of {name}"))
         with self._lock:
             self._check_open()
