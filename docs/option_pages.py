@@ -15,7 +15,7 @@ from ibrobot_core.config.describe import described, type_name
 from ibrobot_core.convert import is_mapping, is_sequence
 from ibrobot_core.options import fields
 from ibrobot_core.plugins import installed_plugins
-from ibrobot_core.schema import SECTIONS
+from ibrobot_core.schema import RobotConfig
 
 
 def config_page() -> Iterator[str]:
@@ -27,7 +27,7 @@ def config_page() -> Iterator[str]:
     yield "by where that Python package is.\n"
     yield "| section | | contents |"
     yield "|---|---|---|"
-    for name, field in SECTIONS.items():
+    for name, field in RobotConfig.sections().items():
         required = "required" if field.default is attrs.NOTHING else ""
         target = next((f"[`{name}`](#{_anchor(kind)})" for _, kind in _classes(name, field.type)), f"`{name}`")
         yield f"| {target} | {required} | {flags_as_code(field.metadata['help'])} |"
@@ -36,7 +36,7 @@ def config_page() -> Iterator[str]:
         yield f"| [`{name}`](#{_options_anchor('section', name)}) | | {registry.find('section', name).summary} |"
     yield ""
     shown: set[type] = set()
-    for name, field in SECTIONS.items():
+    for name, field in RobotConfig.sections().items():
         for path, kind in _classes(name, field.type):
             yield from _class_lines(path, kind, shown)
 
@@ -88,7 +88,7 @@ def jobs_page() -> Iterator[str]:
     yield "With `--events`, these commands print what they do as lines of JSON: `event` is the name of the event, the"
     yield "other keys are its fields. A command that ends with an error prints `failed` at last, with the `error`."
     yield "A plugin declares the options and events of its command; command line, forms and checks derive from that. A"
-    yield "program in Python reads a line with {py:func}`~ibrobot_core.events.decode_event`.\n"
+    yield "program in Python reads a line with `read_event` of `ibrobot_provenance.asking`.\n"
     registry = installed_plugins()
     for name, command in sorted(registry.commands.items()):
         if not command.events:

@@ -21,22 +21,17 @@ from ibrobot_core.config.expand import VARIABLE as VARIABLE
 from ibrobot_core.schema import (
     ControlMode as ControlMode,
     ExecutorConfig as ExecutorConfig,
-    RecordingConfig as RecordingConfig,
     ModelConfig as ModelConfig,
     Mount as Mount,
     Align as Align,
-    TASK_KEY as TASK_KEY,
-    SECTIONS as SECTIONS,
 )
 from ibrobot_core.config.load import (
-    shipped_configs as shipped_configs,
     read_document as read_document,
     contract_alone as contract_alone,
 )
-from ibrobot_core.component_config import ComponentConfig as ComponentConfig, component_of as component_of
+from ibrobot_core.component_config import ComponentConfig as ComponentConfig
 from ibrobot_core.config.overrides import (
     Override as Override,
-    apply_overrides as apply_overrides,
     single_options as single_options,
 )
 from ibrobot_core.config.yaml_nodes import Document as Document, parse_yaml as parse_yaml
@@ -46,9 +41,6 @@ from ibrobot_core.config.show import dump_yaml as dump_yaml, plain as plain
 from ibrobot_core.plugins import (
     Registry as Registry,
     installed_plugins as installed_plugins,
-    example_type as example_type,
-    official_plugins as official_plugins,
-    install_command as install_command,
 )
 
 # A run
@@ -64,14 +56,12 @@ from ibrobot_core.interfaces.run import (
 )
 from ibrobot_core.launch.runtime import Runtime as Runtime
 from ibrobot_core.component import Component as Component, SessionWorker as SessionWorker, CONTROL as CONTROL
-from ibrobot_core.bug_reports import error_line as error_line, error_text as error_text
+from ibrobot_core.bug_reports import error_text as error_text
 from ibrobot_core.interfaces.run_state import ControlState as ControlState
 from ibrobot_core.run_hooks import RunHooks as RunHooks, RUN_KEYS as RUN_KEYS, check_key as check_key
 from ibrobot_core.launch.episodes import Episodes as Episodes
-from ibrobot_core.component import TransportLink as TransportLink
 from ibrobot_core.launch.models import check_models as check_models
-from ibrobot_core.inference.build import build_policy as build_policy
-from ibrobot_core.launch.absence import absent_sensors as absent_sensors, notes_of as notes_of
+from ibrobot_core.launch.absence import notes_of as notes_of
 
 # Sources
 from ibrobot_core.component import SourceWorker as SourceWorker
@@ -91,17 +81,11 @@ from ibrobot_core.services import (
     RequestLimits as RequestLimits,
 )
 from ibrobot_core.launch.authority import Agent as Agent, Authority as Authority, Grant as Grant
-from ibrobot_core.interfaces.policy import (
-    check_finite as check_finite,
-)
 
 # Episodes and datasets
-from ibrobot_core.interfaces.reader import find_episode as find_episode
 from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler, FrameSampler as FrameSampler
 from ibrobot_core.selection import (
-    Leaf as Leaf,
     JointFeature as JointFeature,
-    value_at as value_at,
 )
 from ibrobot_core.contract.specs import SignalPart as SignalPart
 from ibrobot_core.contract.vectors import PolicyVectors as PolicyVectors
@@ -124,9 +108,8 @@ from ibrobot_core.events import (
     Emit as Emit,
     Failed as Failed,
     Shown as Shown,
-    decode_event as decode_event,
 )
-from ibrobot_core.safe_output import echo as echo, confirm as confirm, prompt as prompt, LogFormatter as LogFormatter
+from ibrobot_core.safe_output import echo as echo, LogFormatter as LogFormatter
 from ibrobot_core.screen import Screen as Screen, styled as styled
 from ibrobot_core.cli.display import RunDisplay as RunDisplay, RunTerminal as RunTerminal
 from ibrobot_core.signals import on_signals as on_signals, end_signals as end_signals
@@ -145,7 +128,6 @@ from ibrobot_core.errors import (
     Problem as Problem,
     RequestError as RequestError,
     ComponentFailed as ComponentFailed,
-    Declined as Declined,
     Unsuccessful as Unsuccessful,
     WireError as WireError,
     wrong_input as wrong_input,

@@ -55,14 +55,10 @@ def as_failure(error: BaseException) -> Exception:
     return error if isinstance(error, Exception) else ComponentFailed(f"its thread was ended by {error!r}")
 
 
-def error_text(error: BaseException) -> str:
-    """The message of an error, possibly in several lines."""
-    return str(error).strip() if isinstance(error, IbrobotError) else describe_bug(error)
-
-
-def error_line(error: BaseException) -> str:
-    """The message of an error on one line."""
-    return error_text(error).replace("\n", "; ")
+def error_text(error: BaseException, newline: str = "\n") -> str:
+    """The message of an error; its lines are separated by `newline`."""
+    text = str(error).strip() if isinstance(error, IbrobotError) else describe_bug(error)
+    return text.replace("\n", newline)
 
 
 def exit_code(error: BaseException) -> int:

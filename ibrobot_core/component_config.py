@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 from typing import Any, ClassVar, get_args
 
 import attrs
@@ -29,6 +30,12 @@ class ComponentConfig:
     def __attrs_init_subclass__(cls) -> None:
         documented(cls)
 
+    @staticmethod
+    def within(kind: Any) -> builtins.type[ComponentConfig] | None:
+        """The component class in a type annotation: that of a section, or of each of its items."""
+        members = (kind, *get_args(kind))
+        return next((each for each in members if isinstance(each, type) and issubclass(each, ComponentConfig)), None)
+
     @classmethod
     def type_key(cls) -> str:
         """The key that names the plugin."""
@@ -40,9 +47,3 @@ class NamedComponentConfig(ComponentConfig):
     """One of several named components."""
 
     name: str = not_a_key()
-
-
-def component_of(kind: Any) -> type[ComponentConfig] | None:
-    """The component class in a type annotation: that of a section, or of each of its items."""
-    members = (kind, *get_args(kind))
-    return next((each for each in members if isinstance(each, type) and issubclass(each, ComponentConfig)), None)

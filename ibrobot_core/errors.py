@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copyreg
 import errno
+import json
 import os
 import shlex
 import shutil
@@ -21,13 +22,22 @@ _LISTED = 50
 """Maximum number of problems in a message, to fit on a screen."""
 
 
+EXTRAS = Path(__file__).with_name("official_extras.json")
+"""Extra of `ibrobot` -> the packages that it installs. `python tests/house/official_plugins.py` writes it."""
+
+
 def how_to_install(*packages: str) -> str:
     """The command that installs packages into the environment that runs.
 
     An environment that uv made has no pip, and the pip of a shell may be another Python's. The environment variable
-    IBROBOT_INSTALLER replaces the command, e.g. `pixi add --pypi`.
+    IBROBOT_INSTALLER replaces the command, e.g. `pixi add --pypi`. Several packages that an extra of `ibrobot` covers
+    are named by the smallest such extra.
     """
-    names = " ".join(f'"{each}"' if "[" in each else each for each in packages)
+    wanted = dict.fromkeys(packages)
+    extras: dict[str, list[str]] = json.loads(EXTRAS.read_bytes()) if len(wanted) > 1 else {}
+    if covering := [name for name, content in extras.items() if wanted.keys() <= set(content)]:
+        wanted = dict.fromkeys([f"ibrobot[{min(covering, key=lambda name: len(extras[name]))}]"])
+    names = " ".join(f'"{each}"' if "[" in each else each for each in wanted)
     here = shlex.quote(sys.executable)
     if installer := os.environ.get("IBROBOT_INSTALLER"):
         return f"{installer} {names}"
@@ -263,15 +273,6 @@ class NotSupported(IbrobotError):
     """An implementation does not support a feature, e.g. `control.stop: relax` without torque control."""
 
     exit_code = 2
-
-
-class Declined(IbrobotError):
-    """The user answered a question with no; earlier steps are not undone."""
-
-    from_input = False
-
-    def __init__(self) -> None:
-        super().__init__("stopped: the answer was no")
 
 
 _OF_THE_MACHINE = {errno.ENOSPC, errno.EDQUOT, errno.ENOMEM, errno.EMFILE, errno.ENFILE, errno.EFBIG, errno.EIO}

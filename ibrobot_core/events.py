@@ -8,14 +8,11 @@ own. A line of another shape is an error.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import attrs
 
-from ibrobot_core.errors import WireError
 from ibrobot_core.options import option
-
-_BEGIN = '{"event": '
 
 
 @attrs.frozen
@@ -57,29 +54,3 @@ class Failed(Event):
 def encode_event(event: Event) -> str:
     """An event as a line of JSON, with the name of its class in lower case."""
     return json.dumps({"event": type(event).__name__.lower(), **attrs.asdict(event)}, allow_nan=False)
-
-
-def decode_event(line: str, kinds: Sequence[type[Event]]) -> Event | None:
-    """The event in a line of a command's output; None for other output.
-
-    Args:
-        line: the line.
-        kinds: the classes of events to expect.
-
-    Raises:
-        WireError: for an event of no such class, or of another shape.
-    """
-    if not line.startswith(_BEGIN):
-        return None
-    from ibrobot_core.convert import Converter
-
-    known = {kind.__name__.lower(): kind for kind in kinds}
-    try:
-        facts = json.loads(line)
-        name = str(facts.pop("event"))
-        if name not in known:
-            raise WireError(f"unknown event {name!r}; declared: {', '.join(known)}")
-        event: Event = Converter().structure(facts, known[name])
-    except (ValueError, RecursionError) as error:
-        raise WireError(f"malformed event: {error}: {line[:200]}") from None
-    return event

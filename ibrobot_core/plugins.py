@@ -31,7 +31,8 @@ from ibrobot_core.errors import (
 from ibrobot_core.options import did_you_mean
 
 if TYPE_CHECKING:
-    from ibrobot_core.interfaces import EpisodeReader
+    from ibrobot_core.interfaces import EpisodeReader, Policy
+    from ibrobot_core.interfaces.run_state import AbsentSensor
     from ibrobot_core.messages import CompressedImage, Image
     from ibrobot_core.schema import RobotConfig
 
@@ -63,8 +64,6 @@ OFFICIAL = Path(__file__).with_name("official_plugins.json")
 package contains. Errors name missing plugins from it. `python tests/house/official_plugins.py` writes it."""
 RECORDS = "records"
 """The key in `OFFICIAL` for the section whose component records episodes."""
-EXTRAS = Path(__file__).with_name("official_extras.json")
-"""Extra of `ibrobot` -> the packages that it installs. `python tests/house/official_plugins.py` writes it."""
 
 _CLASSES = {"str": str, "Path": Path, "builtins.type[Any]": type, "Late": descriptors.Late}
 """Annotation -> class, for the fields of descriptors that commands read even if they use nothing of the plugin."""
@@ -195,7 +194,7 @@ class Registry:
         """
         sections = self.of_kind("section")
         if not any(isinstance(each, descriptors.SectionDescriptor) and each.records_episodes for each in sections):
-            ((type_,),) = (offers[RECORDS] for offers in official_plugins().values() if RECORDS in offers)
+            (type_,) = self.official(RECORDS)
             error = self.not_found("section", type_)
             assert isinstance(error, PluginNotInstalled)
             raise PluginNotInstalled("section", "recording", error.package, error.reason)
@@ -212,7 +211,7 @@ class Registry:
         if defaults:
             packages = ", ".join(f"{entry.descriptor.type} ({entry.package})" for entry in defaults)
             raise PluginError(f"name the type of the {kind}: several plugins offer a default: {packages}")
-        package = next(name for name, offers in official_plugins().items() if kind in offers.get("default", ()))
+        package = self.official("default")[kind]
         raise PluginError(f"no {kind} is named, and no installed plugin has a default: {how_to_install(package)}")
 
     def missing(self, kind: str, type_: str, options: descriptors.Options | None = None) -> MissingDependency | None:
@@ -235,6 +234,52 @@ class Registry:
             return MissingDependency(f"its check failed: {_reason(error)}", remedy=f"report it to {package}")
         return None
 
+    def shipped_configs(self) -> dict[str, Path]:
+        """Name -> file of the robot YAMLs shipped with ibrobot and plugins; ibrobot's own first."""
+        package = Path(__file__).parent
+        in_wheel = package / "_configs"
+        folder = in_wheel if in_wheel.is_dir() else package.parent / "configs"
+        configs = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+        for config in self.configs:
+            configs.setdefault(config.name, config.path)
+        return configs
+
+    def absent_sensors(self, config: RobotConfig) -> tuple[AbsentSensor, ...]:
+        """The peripherals whose plugins lack a dependency on this machine, and those that are not connected.
+
+        Raises:
+            MissingDependency: for a peripheral whose topic is unknown before it runs, so that its users are unknown
+                too.
+        """
+        from ibrobot_core.interfaces.run_state import AbsentSensor
+
+        absent = []
+        for name, peripheral in config.peripherals.items():
+            try:
+                missing = self.missing("sensor", peripheral.type, peripheral.options)
+            except PluginNotInstalled as error:
+                missing = MissingDependency(error.missing, remedy=error.remedy)
+            if missing is None:
+                continue
+            if not peripheral.published:
+                raise missing
+            absent.append(AbsentSensor(name, f"{peripheral.kind} {name}", peripheral.published, missing))
+        return tuple(absent)
+
+    def build_policy(self, config: RobotConfig, name: str, seed: int = 0) -> Policy:
+        """The model `name` of a robot, which is not loaded yet; for a process that runs no other part of the robot.
+
+        Raises:
+            PluginError: if its plugin is not installed.
+            PolicyError: e.g. for a checkpoint without its statistics.
+        """
+        from ibrobot_core.clock import RealClock
+        from ibrobot_core.interfaces import Context
+
+        model = config.models[name]
+        policy: Policy = self.create("policy", model.type, model.options, Context.of(config, name, RealClock(), seed))
+        return policy
+
     def open_episode(self, path: Path, given: Mapping[str, str] | None = None) -> EpisodeReader:
         """A reader of an episode.
 
@@ -254,7 +299,7 @@ class Registry:
                     raise RecorderError(f"{path}: {address.path} is a single episode; leave :{address.number} out")
                 return reader.make(address)
         formats = ", ".join(f"{reader.type} ({reader.summary})" for reader in self.readers)
-        packages = " or ".join(name for name, offers in official_plugins().items() if "reader" in offers)
+        packages = " or ".join(dict.fromkeys(self.official("reader").values()))
         hint = "" if formats else f"; {how_to_install(packages)}"
         raise RecorderError(f"{path}: not an episode of a known format; installed: {formats or 'none'}{hint}")
 
@@ -275,13 +320,17 @@ class Registry:
         what = plugin_type(kind, type_)
         if packages := self.doubles.get((kind, type_)):
             return PluginError(f"{what} is offered by {' and '.join(packages)}: uninstall all but one of them")
-        package = next((name for name, offers in official_plugins().items() if type_ in offers.get(kind, ())), None)
+        package = self.official(kind).get(type_)
         for failure in self.failures:
             if failure.package == package:
                 return PluginNotInstalled(kind, type_, package, f"{what} is not available: {failure}")
         if package is not None:
             return PluginNotInstalled(kind, type_, package)
         return PluginError(f"unknown {what}{did_you_mean(type_, self.types(kind), 'installed')}{self.broken}")
+
+    def official(self, kind: str) -> Mapping[str, str]:
+        """Types of a kind, or commands, of this project's packages, installed or not -> the package."""
+        return {type_: package for package, offers in official_plugins().items() for type_ in offers.get(kind, ())}
 
     @property
     def broken(self) -> str:
@@ -313,16 +362,6 @@ def official_plugins() -> Mapping[str, Mapping[str, list[str]]]:
     """The content of `OFFICIAL`."""
     packages: dict[str, dict[str, list[str]]] = json.loads(OFFICIAL.read_bytes())
     return packages
-
-
-def install_command(packages: Iterable[str]) -> str:
-    """A command that installs packages: the smallest extra of `ibrobot` that covers several, or their names."""
-    wanted = list(dict.fromkeys(packages))
-    extras: dict[str, list[str]] = json.loads(EXTRAS.read_bytes())
-    covering = [name for name, content in extras.items() if len(wanted) > 1 and set(wanted) <= set(content)]
-    if covering:
-        return how_to_install(f"ibrobot[{min(covering, key=lambda name: len(extras[name]))}]")
-    return how_to_install(*wanted)
 
 
 def example_type(kind: str) -> str:

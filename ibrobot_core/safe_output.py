@@ -15,7 +15,6 @@ from urllib.parse import quote
 
 import click
 
-from ibrobot_core.errors import RequestError
 from ibrobot_core.options import HIDDEN
 
 _CONTROL = "\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ud800-\udfff\U000e0000-\U000e0fff"
@@ -64,25 +63,6 @@ def echo(message: object = "", *, err: bool = False, nl: bool = True) -> None:
     """Print a message; see `printable`."""
     # Pass the stream, since click otherwise writes UTF-8 to an ASCII terminal.
     click.echo(printable(str(message)), file=sys.stderr if err else sys.stdout, nl=nl)
-
-
-def confirm(question: str, *, flag: str, default: bool = False) -> bool:
-    """Ask a yes/no question; see `prompt`."""
-    answer = prompt(f"{question} [{'Y/n' if default else 'y/N'}]: ", flag=flag)
-    return answer.strip().lower() in (("y", "yes", "") if default else ("y", "yes"))
-
-
-def prompt(question: str, *, flag: str) -> str:
-    """Ask for a line, which `flag` gives on the command line.
-
-    Raises:
-        RequestError: if standard input has no answer, e.g. in a script.
-    """
-    echo(question, nl=False)
-    try:
-        return input()
-    except EOFError:
-        raise RequestError(f"{question} Standard input has no answer: run it in a terminal, or give {flag}") from None
 
 
 class LogFormatter(logging.Formatter):

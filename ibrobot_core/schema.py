@@ -8,12 +8,13 @@ from __future__ import annotations
 import math
 import types
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 import attrs
 
-from ibrobot_core.component_config import ComponentConfig, NamedComponentConfig, component_of
+from ibrobot_core.component_config import ComponentConfig, NamedComponentConfig
 from ibrobot_core.deadman import Deadman
 from ibrobot_core.errors import PluginNotInstalled
 from ibrobot_core.messages import Image
@@ -472,17 +473,19 @@ class RobotConfig:
     secrets: Mapping[str, str] = not_a_key(factory=dict, repr=False, eq=False)
     """Secret -> text shown in its place."""
 
+    @classmethod
+    @cache
+    def sections(cls) -> Mapping[str, attrs.Attribute[Any]]:
+        """The sections of a robot YAML, with their types in the file."""
+        return {name: _as_written(field) for name, field in fields(cls).items()}
+
 
 def _as_written(field: attrs.Attribute[Any]) -> attrs.Attribute[Any]:
     """A section's field with its type in the file, where it may be missing but not null."""
     kind: Any = field.type
-    component = component_of(kind)
+    component = ComponentConfig.within(kind)
     if get_origin(kind) is types.UnionType:
         kind, _ = get_args(kind)
     elif component is not None and "name" in fields(component):
         return field.evolve(type=tuple[component, ...], default=())  # type: ignore[valid-type]
     return field.evolve(type=kind)
-
-
-SECTIONS: Mapping[str, attrs.Attribute[Any]] = {name: _as_written(field) for name, field in fields(RobotConfig).items()}
-"""The sections of a robot YAML, with their types in the file."""

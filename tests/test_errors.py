@@ -17,7 +17,6 @@ from ibrobot_core import errors
 from ibrobot_core.errors import (
     ComponentFailed,
     ConfigError,
-    Declined,
     IbrobotError,
     MissingDependency,
     PlanCode,
@@ -33,7 +32,6 @@ MADE = (
     MissingDependency("OpenGL", apt=("libegl1",)),
     PlanningError("too far", PlanCode.NO_IK_SOLUTION),
     ComponentFailed("killed", 3),
-    Declined(),
 )
 
 

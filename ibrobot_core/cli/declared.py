@@ -24,13 +24,13 @@ from ibrobot_core.safe_output import echo
 
 
 class EpisodePath(click.Path):
-    """A recorded episode or a folder of them: a path, or a short name such as `pick:1`; see `find_episode`."""
+    """A recorded episode or a folder of them: a path, or a short name such as `pick:1`; see `EpisodeAddress.find`."""
 
     @override
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        from ibrobot_core.interfaces.reader import find_episode
+        from ibrobot_core.interfaces.reader import EpisodeAddress
 
-        return find_episode(Path(os.fsdecode(super().convert(value, param, ctx))))
+        return EpisodeAddress.find(Path(os.fsdecode(super().convert(value, param, ctx))))
 
 
 @runtime_checkable

@@ -18,7 +18,7 @@ from ibrobot_core.bug_reports import DEBUG, describe_bug
 from ibrobot_core.cli.command import let_interrupts_raise
 from ibrobot_core.descriptors import Command
 from ibrobot_core.errors import IbrobotError
-from ibrobot_core.plugins import CORE, installed_plugins, official_plugins
+from ibrobot_core.plugins import CORE, installed_plugins
 from ibrobot_core.safe_output import echo
 
 _FAILED, _WRONG, _INTERRUPTED = 1, 2, 130
@@ -69,7 +69,7 @@ class Commands(click.Group):
         if any(each.startswith(f"{name} ") for each in registry.commands):
             return Commands(name)
         if name not in registry.commands:
-            if any(name in offers.get("command", ()) for offers in official_plugins().values()):
+            if name in registry.official("command"):
                 raise registry.not_found("command", name)
             return None
         return _click_command(registry.command(name))
@@ -122,7 +122,7 @@ def main() -> None:
         echo(error.format_message(), err=True)
         code = _WRONG
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the end of the process: nothing else can tell it
-        lines, code = _error_lines(error)
+        lines, code = _error_texts(error)
         for line in lines:
             echo(f"error: {line}", err=True)
     sys.exit(code)
@@ -148,7 +148,7 @@ def _suggestion(message: str, ctx: click.Context | None) -> str:
     return f", did you mean {close[0]!r}?" if close else ""
 
 
-def _error_lines(error: BaseException) -> tuple[list[str], int]:
+def _error_texts(error: BaseException) -> tuple[list[str], int]:
     """The message lines of an error, and the exit code."""
     if isinstance(error, IbrobotError):
         return str(error).splitlines(), error.exit_code

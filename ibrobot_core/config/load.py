@@ -9,7 +9,6 @@ from typing import Any
 
 import attrs
 
-import ibrobot_core
 from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.config.checks import Checks
 from ibrobot_core.config.contract_checks import ContractChecks
@@ -82,8 +81,8 @@ def contract_alone(document: Document, base: Path, registry: Registry | None = N
     return contract
 
 
-def read_document(path: str | Path) -> Document:
-    """Read a YAML file that is a mapping of sections; does not check their content.
+def read_document(path: str | Path, overrides: Sequence[str] = ()) -> Document:
+    """Read a YAML file that is a mapping of sections, and apply overrides; does not check their content.
 
     Raises:
         ConfigError: if it cannot be read, or is not a mapping.
@@ -98,6 +97,7 @@ def read_document(path: str | Path) -> Document:
     if not isinstance(document.root, Mapping):
         document.add((), f"expected a mapping of sections, got {shown(document.root)}")
         document.raise_problems()
+    apply_overrides(document, overrides)
     return document
 
 
@@ -227,17 +227,6 @@ def _not_installed(document: Document, sections: ParsedSections) -> dict[str, Pe
     }
 
 
-def shipped_configs(registry: Registry) -> dict[str, Path]:
-    """Name -> file of the robot YAMLs shipped with ibrobot and plugins; ibrobot's own first."""
-    package = Path(ibrobot_core.__file__).parent
-    in_wheel = package / "_configs"
-    folder = in_wheel if in_wheel.is_dir() else package.parent / "configs"
-    configs = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
-    for config in registry.configs:
-        configs.setdefault(config.name, config.path)
-    return configs
-
-
 def find_config(name: str | None, registry: Registry) -> Path:
     """Find a config by `name`: a path, or the name of a shipped config with or without `.yaml`.
 
@@ -247,7 +236,7 @@ def find_config(name: str | None, registry: Registry) -> Path:
     name = name or DEFAULT_CONFIG
     if Path(name).is_file():
         return Path(name)
-    known = shipped_configs(registry)
+    known = registry.shipped_configs()
     stem = name.removesuffix(".yaml")
     if stem in known:
         return known[stem]

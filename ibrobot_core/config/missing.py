@@ -10,7 +10,6 @@ import attrs
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.convert import Key
 from ibrobot_core.errors import PluginNotInstalled, how_to_install, plugin_type
-from ibrobot_core.plugins import install_command
 from ibrobot_core.schema import ContractConfig
 
 _OPTIONAL_SENSORS = ("camera",)
@@ -92,7 +91,7 @@ def describe(errors: Iterable[PluginNotInstalled]) -> str:
     if absent:
         names = ", ".join(plugin_type(kind, type_) for kind, type_ in absent)
         needs = "needs a plugin that is" if len(absent) == 1 else "need plugins that are"
-        command = install_command(error.package for error in distinct if not error.reason)
+        command = how_to_install(*(error.package for error in distinct if not error.reason))
         texts.append(f"{names} {needs} not installed: {command}")
     return "; ".join(texts)
 

@@ -63,7 +63,7 @@ def _without_secrets(value: Any, shown: Mapping[str, str]) -> Any:
 
 def document(config: schema.RobotConfig) -> dict[str, Any]:
     """The complete robot YAML of this run as plain values, with `${…}` or `***` for secrets."""
-    sections = {name: plain(getattr(config, name)) for name in schema.SECTIONS}
+    sections = {name: plain(getattr(config, name)) for name in config.sections()}
     sections |= {name: plain(section.options) for name, section in config.plugin_sections.items()}
     sections["peripherals"] = list(sections["peripherals"].values())
     if list(config.hardware) == ["hardware"]:

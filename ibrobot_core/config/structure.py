@@ -11,7 +11,7 @@ from typing import Any
 import attrs
 
 from ibrobot_core import schema
-from ibrobot_core.component_config import ComponentConfig, NamedComponentConfig, component_of
+from ibrobot_core.component_config import ComponentConfig, NamedComponentConfig
 from ibrobot_core.config.expand import missing_package, resolve_path
 from ibrobot_core.config.missing import Missing
 from ibrobot_core.config.repair import structure_rest
@@ -84,7 +84,7 @@ class _Outline(Converter):
     """Keeps components as mappings, to be structured later by their plugins."""
 
     def structure(self, value: Any, kind: Any) -> Any:
-        component = component_of(kind)
+        component = ComponentConfig.within(kind)
         if component is kind or (component is not None and component.may_be_alone):
             kind = Mapping[str, Any]
         return super().structure(value, kind)
@@ -156,9 +156,11 @@ class SectionParser:
         self._sections(sections, ("contract",))
         return sections
 
-    def _sections(self, sections: ParsedSections, names: Collection[str] = tuple(schema.SECTIONS)) -> None:
+    def _sections(
+        self, sections: ParsedSections, names: Collection[str] = tuple(schema.RobotConfig.sections())
+    ) -> None:
         """Parse the top level: sections without components; unknown and missing sections are faults."""
-        known = {name: field for name, field in schema.SECTIONS.items() if name in names}
+        known = {name: field for name, field in schema.RobotConfig.sections().items() if name in names}
         faults = Faults()
         for name, value in self.document.root.items():
             if name not in known:
@@ -197,7 +199,7 @@ class SectionParser:
             if isinstance(error, PluginNotInstalled):
                 self._missing.append(Missing((name,), (name,), error))
             else:
-                known = [*schema.SECTIONS, *self.registry.types("section")]
+                known = [*schema.RobotConfig.sections(), *self.registry.types("section")]
                 faults.add((name,), unknown_key(name, known) + self.registry.broken)
         elif value is not None:
             if isinstance(value, Mapping):
@@ -294,7 +296,7 @@ class SectionParser:
                 message = f"unknown key with {kind.type_key()} {descriptor.type!r}; it belongs to {types}"
                 faults.add((name,), message if others else unknown_key(name, [*own, *known]))
         before = len(faults.found)
-        kinds = {name: component_of(field.type) for name, field in known.items()}
+        kinds = {name: ComponentConfig.within(field.type) for name, field in known.items()}
         inner = {name: each for name, each in kinds.items() if each is not None}
         plain = {name: field for name, field in known.items() if name not in inner}
         arguments = self._converter.arguments(plain, value, faults)

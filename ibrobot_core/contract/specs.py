@@ -14,11 +14,11 @@ import attrs
 from ibrobot_core.config.contract_checks import completed
 from ibrobot_core.errors import ContractError
 from ibrobot_core.interfaces.feature import Feature
-from ibrobot_core.messages import MESSAGE_TYPES, CompressedImage, Image, JointState
+from ibrobot_core.messages import MESSAGE_TYPES, CompressedImage, Image, JointState, Message
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.robot import Robot
 from ibrobot_core.schema import MAX_AGE, ActionSpec, Align, ImageSpec, ObservationSpec, RobotConfig
-from ibrobot_core.selection import JointFeature, Selection
+from ibrobot_core.selection import JointFeature, Selection, value_at
 from ibrobot_core.units import NS_PER_S
 
 _IMAGE_DTYPES = {"16UC1": "uint16", "32FC1": "float32"}
@@ -85,6 +85,14 @@ class SignalPart:
     """Path to the text or number in a message."""
     align: str = "hold"
     """As `ActionPart.align`."""
+
+    def value(self, message: Message) -> Any:
+        """The value at its path; None if the path continues beyond a number or text.
+
+        Raises:
+            ContractError: for a missing field or element.
+        """
+        return value_at(message, self.path.split("."))
 
     @property
     def feature(self) -> Feature:

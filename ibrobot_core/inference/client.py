@@ -16,7 +16,6 @@ import numpy as np
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.inference.engine import LocalEngine
 from ibrobot_core.interfaces import Engine, Frame, Policy
-from ibrobot_core.interfaces.policy import check_finite
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns
 
@@ -102,12 +101,12 @@ def run_policy(
     try:
         with turn:
             tensors = policy.preprocess(request.frame)
-        check_finite("the policy's preprocess", tensors)
+        Policy.check_finite("the policy's preprocess", tensors)
         outputs = engine.infer(tensors, request.id, deadline_ns)
-        check_finite("the policy's infer", outputs)
+        Policy.check_finite("the policy's infer", outputs)
         with turn:
             actions = np.array(policy.postprocess(outputs), dtype=np.float64)  # a policy may reuse its array
-        check_finite("the policy's postprocess", {"action": actions})
+        Policy.check_finite("the policy's postprocess", {"action": actions})
     except PolicyError as error:
         return Chunk(request.id, stamp_ns, None, str(error))
     except Exception as error:

@@ -54,7 +54,7 @@ class Frame:
             raise PolicyError(f"the policy needs {key} of shape {shape}, got {value.shape}")
         if len(shape) == 3 and value.dtype != np.uint8:
             raise PolicyError(f"the policy needs {key} with 8-bit pixels, got {value.dtype}")
-        check_finite("the observation", {key: value})
+        Policy.check_finite("the observation", {key: value})
         return value
 
 
@@ -89,22 +89,6 @@ class PolicySpec:
 
 def _fits(shape: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
     return len(shape) == len(wanted) and all(n == m or (m == -1 and n > 0) for n, m in zip(shape, wanted, strict=True))
-
-
-def check_finite(stage: str, tensors: Tensors) -> None:
-    """Check that no tensor has NaN or infinity.
-
-    Args:
-        stage: what made them, for the error, e.g. `the policy's infer`.
-        tensors: name -> array; only floats are checked.
-
-    Raises:
-        PolicyError: names the stage, and the first value that is not finite.
-    """
-    for name, array in tensors.items():
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            index = np.argwhere(~np.isfinite(array))[0].tolist()
-            raise PolicyError(f"{stage}: {name}{index or ''} is {array[tuple(index)]}, must be finite")
 
 
 class PictureCodec(ABC):
@@ -148,6 +132,22 @@ class Policy(ABC):
         Raises:
             PolicyError: if tensors are missing or have a wrong dtype or shape; names them.
         """
+
+    @staticmethod
+    def check_finite(stage: str, tensors: Tensors) -> None:
+        """Check that no tensor has NaN or infinity.
+
+        Args:
+            stage: what made them, for the error, e.g. `the policy's infer`.
+            tensors: name -> array; only floats are checked.
+
+        Raises:
+            PolicyError: names the stage, and the first value that is not finite.
+        """
+        for name, array in tensors.items():
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                index = np.argwhere(~np.isfinite(array))[0].tolist()
+                raise PolicyError(f"{stage}: {name}{index or ''} is {array[tuple(index)]}, must be finite")
 
     def check_tensors(
         self,

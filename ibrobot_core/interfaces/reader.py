@@ -64,21 +64,6 @@ _ROOT = Path("episodes")
 """Folder of datasets whose episodes need no path."""
 
 
-def find_episode(path: Path) -> Path:
-    """The folder of a recorded episode that a short name means; any other path as it is.
-
-    `ROOT/pick:1` is `ROOT/pick/episodes/episode_000001`, and `pick:1` alone also that below `episodes`.
-    """
-    named = _NUMBERED.fullmatch(path.name)
-    if named is None or path.exists():
-        return path
-    dataset = path.with_name(named[1])
-    if path == Path(path.name) and not dataset.exists():
-        dataset = _ROOT / dataset
-    folder = dataset / "episodes" / f"episode_{int(named[2]):06d}"
-    return folder if folder.exists() else path
-
-
 @attrs.frozen
 class EpisodeAddress:
     """The address of an episode."""
@@ -90,6 +75,21 @@ class EpisodeAddress:
     """Metadata for an episode that has none, by the recorder's names: `contract`, `config`, `calibration`;
     `norm_mode`, the unit of its joints; `names`, JSON of feature -> names of its elements in their order."""
 
+    @staticmethod
+    def find(path: Path) -> Path:
+        """The folder of a recorded episode that a short name means; any other path as it is.
+
+        `ROOT/pick:1` is `ROOT/pick/episodes/episode_000001`, and `pick:1` alone also that below `episodes`.
+        """
+        named = _NUMBERED.fullmatch(path.name)
+        if named is None or path.exists():
+            return path
+        dataset = path.with_name(named[1])
+        if path == Path(path.name) and not dataset.exists():
+            dataset = _ROOT / dataset
+        folder = dataset / "episodes" / f"episode_{int(named[2]):06d}"
+        return folder if folder.exists() else path
+
     @classmethod
     def of(cls, path: Path, given: Mapping[str, str] | None = None) -> EpisodeAddress:
         """Parse the path of an episode, its short name, or `DATASET:N`.
@@ -97,7 +97,7 @@ class EpisodeAddress:
         Raises:
             RecorderError: if it does not exist.
         """
-        path = find_episode(path)
+        path = cls.find(path)
         if path.exists():
             return cls(path, None, given or {})
         named = _NUMBERED.fullmatch(path.name)

@@ -9,39 +9,19 @@ from collections.abc import Iterable
 
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.config.missing import absent_models, unavailable_modes
-from ibrobot_core.errors import MissingDependency, PluginNotInstalled
+from ibrobot_core.errors import MissingDependency
 from ibrobot_core.interfaces.run_state import AbsentSensor
 from ibrobot_core.plugins import Registry
-
-
-def absent_sensors(config: RobotConfig, registry: Registry) -> tuple[AbsentSensor, ...]:
-    """The peripherals whose plugins lack a dependency on this machine, and those that are not connected.
-
-    Raises:
-        MissingDependency: for a peripheral whose topic is unknown before it runs, so that its users are unknown too.
-    """
-    absent = []
-    for name, peripheral in config.peripherals.items():
-        try:
-            missing = registry.missing("sensor", peripheral.type, peripheral.options)
-        except PluginNotInstalled as error:
-            missing = MissingDependency(error.missing, remedy=error.remedy)
-        if missing is None:
-            continue
-        if not peripheral.published:
-            raise missing
-        absent.append(AbsentSensor(name, f"{peripheral.kind} {name}", peripheral.published, missing))
-    return tuple(absent)
 
 
 def notes_of(config: RobotConfig, registry: Registry) -> list[str]:
     """What a valid robot lacks on this machine: plugins, sensors and system libraries, with the remedies.
 
     Raises:
-        MissingDependency: as `absent_sensors`.
+        MissingDependency: as `Registry.absent_sensors`.
     """
     notes = [*unavailable_modes(config.unavailable), *absent_models(config.absent_models)]
-    if absent := describe_absent(absent_sensors(config, registry)):
+    if absent := describe_absent(registry.absent_sensors(config)):
         notes.append(f"runs start without {absent}")
     modes = [mode for name, mode in config.control_modes.items() if name not in config.unavailable]
     planners = [("planner", mode.planner.type) for mode in modes if mode.planner is not None]

@@ -12,7 +12,6 @@ from ibrobot_core.contract.specs import Contract
 from ibrobot_core.contract.vectors import PolicyVectors
 from ibrobot_core.dispatch.dispatcher import check_strategy
 from ibrobot_core.errors import ConfigError, ContractError, IbrobotError, Problem
-from ibrobot_core.inference.build import build_policy
 from ibrobot_core.interfaces import PolicySpec
 from ibrobot_core.interfaces.run import Plugins
 from ibrobot_core.plugins import installed_plugins
@@ -76,7 +75,7 @@ def check_models(config: RobotConfig, registry: Plugins, modes: Iterable[str], g
     lines, problems = [], []
     for name in dict.fromkeys(inference.model for inference in used):
         try:
-            with closing(build_policy(config, registry, name)) as policy:
+            with closing(registry.build_policy(config, name)) as policy:
                 check_model(config, config.models[name], policy.spec, logging.getLogger("ibrobot"), given)
                 if name in loaded_here:
                     policy.check_weights()

@@ -10,7 +10,7 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.bug_reports import error_line, error_text, exit_code
+from ibrobot_core.bug_reports import error_text, exit_code
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.component import Component
 from ibrobot_core.config.missing import absent_models, unavailable_modes
@@ -364,7 +364,7 @@ class Runtime:
             try:
                 component.stop()
             except Exception as error:  # noqa: BLE001 - contained: the others must be stopped all the same
-                self.session.log.error("%s did not stop cleanly: %s", component.name, error_line(error))
+                self.session.log.error("%s did not stop cleanly: %s", component.name, error_text(error, "; "))
                 if isinstance(component, ControlComponent) and self.session.failure is None:
                     self.session.failure = component.name, error
 

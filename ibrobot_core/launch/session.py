@@ -13,7 +13,7 @@ from typing import Any
 import attrs
 import numpy as np
 
-from ibrobot_core.bug_reports import as_failure, error_line
+from ibrobot_core.bug_reports import as_failure, error_text
 from ibrobot_core.bus import Bus
 from ibrobot_core.clock import Clock, RealClock, SteppedClock
 from ibrobot_core.component_config import ComponentConfig
@@ -24,7 +24,7 @@ from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError, Mi
 from ibrobot_core.interfaces import Context, JointReading, OperatorEvent, run_state
 from ibrobot_core.interfaces.executor import ExecutorGoal, MoveJoint
 from ibrobot_core.interfaces.run import CommandSource, LaunchRequest
-from ibrobot_core.launch.absence import absent_sensors, by_cause
+from ibrobot_core.launch.absence import by_cause
 from ibrobot_core.launch.authority import Authority
 from ibrobot_core.launch.episodes import Episodes
 from ibrobot_core.plugins import Registry
@@ -121,9 +121,9 @@ class Session:
         """The sensors that this machine cannot run; determined once.
 
         Raises:
-            MissingDependency: as `absent_sensors`.
+            MissingDependency: as `Registry.absent_sensors`.
         """
-        return absent_sensors(self.config, self.registry)
+        return self.registry.absent_sensors(self.config)
 
     def refuse_absent(self, user: str, needs: Callable[[str], bool]) -> None:
         """Refuse a part of the run that needs the messages of a sensor that cannot run here.
@@ -383,7 +383,7 @@ class Session:
     @property
     def failure_text(self) -> str:
         """The component that died and why, on one line; empty without a failure."""
-        return f"{self.failure[0]}: {error_line(self.failure[1])}" if self.failure is not None else ""
+        return f"{self.failure[0]}: {error_text(self.failure[1], '; ')}" if self.failure is not None else ""
 
     @property
     def faults(self) -> tuple[str, ...]:

@@ -16,7 +16,8 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from ibrobot_core.descriptors import SectionDescriptor
-from ibrobot_core.plugins import EXTRAS, OFFICIAL, RECORDS, discover
+from ibrobot_core.errors import EXTRAS
+from ibrobot_core.plugins import OFFICIAL, RECORDS, discover
 
 PLUGINS = Path(__file__).parents[2] / "plugins"
 DISTRIBUTION = PLUGINS / "ibrobot" / "pyproject.toml"

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from ibrobot_core.plugins import EXTRAS, KINDS, OFFICIAL, example_type, official_plugins
+from ibrobot_core.errors import EXTRAS
+from ibrobot_core.plugins import KINDS, OFFICIAL, example_type, official_plugins
 
 CORE = OFFICIAL.parent
 ORDINARY = {"calibrated", "gripper", "imu", "joint", "keyboard", "panel", "process", "processes", "trajectory", "twist"}

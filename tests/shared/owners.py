@@ -31,7 +31,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 from uuid import UUID
@@ -114,7 +113,7 @@ def write(folder: Path, count: int, number: int, pause_s: float = 0.0) -> None:
 
 
 def record(place: Path) -> None:
-    taken = take_next_folder(SimpleNamespace(folder=place / "pick"))  # type: ignore[arg-type]
+    taken = take_next_folder(place / "pick")
     with taken:
         write(taken.path, RECORDED, random.getrandbits(60), 0.016)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ibrobot_core.api import Frame, ns
-from ibrobot_core.app import build_policy, find_config, installed_plugins, load_config
+from ibrobot_core.app import find_config, installed_plugins, load_config
 
 if find_spec("inspect_robots") is None:
     pytest.skip('needs inspect-robots: pip install "ibrobot-gym[inspect]"', allow_module_level=True)
@@ -52,7 +52,7 @@ class Scripted:
         self._moves = moves
         self._rate_hz = embodiment.info.control_hz or 0.0
         config = load_config(find_config("so101_scenes", installed_plugins()), sim=True, mode="pick_cube")
-        self._policy = build_policy(config, installed_plugins(), "pick_cube")
+        self._policy = installed_plugins().build_policy(config, "pick_cube")
         self._policy.load()
 
     def reset(self, scene: Scene) -> None:

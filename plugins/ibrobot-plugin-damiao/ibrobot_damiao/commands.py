@@ -6,18 +6,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
 import attrs
+from ibrobot_terminal.questions import Declined, confirm
 
 from ibrobot_core.api import HardwareError, option
-from ibrobot_core.app import (
-    Declined,
-    RequestError,
-    confirm,
-    echo,
-    find_config,
-    installed_plugins,
-    load_config,
-    wrong_input,
-)
+from ibrobot_core.app import RequestError, echo, find_config, installed_plugins, load_config, wrong_input
 from ibrobot_damiao.bus import BusError, Channel, DamiaoBus, NoAnswer
 from ibrobot_damiao.options import DamiaoOptions
 from ibrobot_damiao.protocol import DEFAULT_BITRATE, DISABLE, ERRORS, OFF, ON, SAVE_ZERO, command

@@ -43,12 +43,11 @@ def _recording(options: EpisodesOptions | None, session: RecordedRun) -> Compone
     from ibrobot_data.partial_recording import PartialRecording
     from ibrobot_data.recording_worker import NoRecording, RecordingWorker
 
-    config = session.config.recording
-    if config is None:
+    if session.config.recording is None:
         return NoRecording("recording", "of nothing")
     if options is None or options.keep == "all":
-        return RecordingWorker(session, config)
-    return PartialRecording(session, config, options)
+        return RecordingWorker(session)
+    return PartialRecording(session, options)
 
 
 def _records(config: RobotConfig) -> bool:

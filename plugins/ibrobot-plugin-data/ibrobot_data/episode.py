@@ -37,14 +37,14 @@ from ibrobot_core.api import (
     RecorderError,
     Robot,
 )
-from ibrobot_core.app import TASK_KEY, installed_plugins
+from ibrobot_core.app import installed_plugins
 from ibrobot_data.commanders import Commanders, is_labelled, stretches
 from ibrobot_data.errors import DiskFull
 from ibrobot_data.growing import GrowingEpisode
 from ibrobot_data.identity import identity
 from ibrobot_data.options import OPERATOR, POLICY
 from ibrobot_data.request import ConversionRequest, EpisodeReport
-from ibrobot_data.ticks import Ticks
+from ibrobot_data.ticks import TASK_KEY, Ticks
 
 SUCCESS = "next.success"
 INTERVENTION, REWARD, DONE = "intervention", "next.reward", "next.done"

@@ -187,7 +187,7 @@ class EpisodeService(Episodes):
             check_prompt(self.prompt)
             self._dataset.check_writable()
             self._dataset.check(contract)
-        left_out = [topic for topic in contract.topics if not is_kept(topic, config, contract)]
+        left_out = [topic for topic in contract.topics if not is_kept(topic, config.topics, contract)]
         if session.request.by_operator and left_out:
             raise RecorderError(
                 f"recording.topics leaves out {', '.join(left_out)}, which the contract needs; no episode could be "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
 from uuid import NAMESPACE_OID, uuid4, uuid5
@@ -13,7 +13,7 @@ from ibrobot_provenance.ownership import InUse, Ownership
 
 import ibrobot_core
 from ibrobot_core.api import MODEL_ANSWERS, Contract, EpisodeStart, ModelAnswer, RecorderError, String
-from ibrobot_core.app import RecordedRun, RecordingConfig, RobotConfig
+from ibrobot_core.app import RecordedRun, RobotConfig
 from ibrobot_data.episode_dataset import EpisodeDataset
 from ibrobot_data.options import GUARD, LABELS
 
@@ -25,13 +25,13 @@ def episode_folder(dataset: Path, number: int) -> Path:
     return dataset / "episodes" / f"{_PREFIX}{number:06d}"
 
 
-def take_next_folder(recording: RecordingConfig) -> Ownership:
+def take_next_folder(dataset: Path) -> Ownership:
     """Take the folder of the dataset's next episode, which does not exist yet, for as long as it is recorded.
 
     Raises:
         RecorderError: if no folder can be created there.
     """
-    root = recording.folder / "episodes"
+    root = dataset / "episodes"
     try:
         root.mkdir(parents=True, exist_ok=True)
         numbers = [path.name.removeprefix(_PREFIX) for path in root.glob(f"{_PREFIX}*")]
@@ -47,9 +47,7 @@ def take_next_folder(recording: RecordingConfig) -> Ownership:
         raise RecorderError(f"recording.root: {root} cannot be created: {error.strerror}") from None
 
 
-def episode_start(
-    session: RecordedRun, recording: RecordingConfig, directory: Path, *, number: int, stamp_ns: int, prompt: str
-) -> EpisodeStart:
+def episode_start(session: RecordedRun, directory: Path, *, number: int, stamp_ns: int, prompt: str) -> EpisodeStart:
     """The start of an episode.
 
     For `topics: contract` it has all topics of the contract, including those not published yet, who commands, and of a
@@ -58,7 +56,6 @@ def episode_start(
 
     Args:
         session: the run.
-        recording: its `recording` section.
         directory: the folder of the episode.
         number: number of the episode in the run, from 1.
         stamp_ns: start of the episode [ns].
@@ -68,6 +65,8 @@ def episode_start(
         RecorderError: if the dataset has another contract.
     """
     config, policy = session.config, session.command_source.described()
+    recording = config.recording
+    assert recording is not None
     topics = {topic: type_ for topic, (type_, _) in session.bus.topics().items()}
     contract = Contract.from_config(config)
     EpisodeDataset(recording.folder).join(contract, config.robot.name, config.robot.robot_type)
@@ -91,15 +90,15 @@ def episode_start(
         }
         kept = {**model_topics(config, policy), **kept}
     else:
-        kept = {topic: type_ for topic, type_ in topics.items() if is_kept(topic, recording, contract)}
+        kept = {topic: type_ for topic, type_ in topics.items() if is_kept(topic, recording.topics, contract)}
     return EpisodeStart(directory, stamp_ns, kept, metadata, any_topic=recording.topics != "contract")
 
 
-def is_kept(topic: str, recording: RecordingConfig, contract: Contract) -> bool:
-    """Whether the `recording` section selects `topic`."""
-    if recording.topics == "contract":
+def is_kept(topic: str, topics: str | Collection[str], contract: Contract) -> bool:
+    """Whether `topics` of the `recording` section selects `topic`."""
+    if topics == "contract":
         return topic in contract.topics or topic in LABELS
-    return recording.topics == "all" or topic in recording.topics
+    return topics == "all" or topic in topics
 
 
 def model_topics(config: RobotConfig, policy: Mapping[str, str] | None) -> dict[str, str]:

@@ -9,7 +9,7 @@ from types import NoneType
 from typing import override
 
 from ibrobot_core.api import EpisodeEnd, RecorderError, String, ns
-from ibrobot_core.app import NoRequest, Received, RecordedRun, RecordingConfig, Service
+from ibrobot_core.app import NoRequest, Received, RecordedRun, Service
 from ibrobot_data.options import COMMANDER, POLICY, EpisodesOptions
 from ibrobot_data.recording_worker import RecordingWorker
 
@@ -24,14 +24,13 @@ class PartialRecording(RecordingWorker):
 
     Args:
         session: the run.
-        config: its section `recording`.
         options: which parts, and how much before and after them.
     """
 
     keeps_whole = False
 
-    def __init__(self, session: RecordedRun, config: RecordingConfig, options: EpisodesOptions) -> None:
-        super().__init__(session, config)
+    def __init__(self, session: RecordedRun, options: EpisodesOptions) -> None:
+        super().__init__(session)
         self._options = options
         self._recent: deque[Received] = deque()
         """The ring buffer."""

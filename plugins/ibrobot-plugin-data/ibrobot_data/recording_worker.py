@@ -32,9 +32,8 @@ from ibrobot_core.app import (
     ComponentFailed,
     Received,
     RecordedRun,
-    RecordingConfig,
     SessionWorker,
-    error_line,
+    error_text,
 )
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.episode_start import episode_start, is_kept, model_topics, take_next_folder
@@ -85,7 +84,9 @@ class RecordingWorker(SessionWorker):
     keeps_whole = True
     """Whether an episode of the run is one recording, so that it can be recorded again."""
 
-    def __init__(self, session: RecordedRun, config: RecordingConfig) -> None:
+    def __init__(self, session: RecordedRun) -> None:
+        config = session.config.recording
+        assert config is not None
         super().__init__(session, "recording", f"{config.type} into {config.root}")
         self._config = config
         self._contract = Contract.from_config(session.config)
@@ -97,7 +98,7 @@ class RecordingWorker(SessionWorker):
         """Pending begins and ends of episodes: stamp [ns] and action."""
         self._pending_lock = threading.Lock()
         """Held while an action is stamped and queued, and while actions and messages are taken, to keep their order."""
-        self._open = False
+        self._open = self._reported_absent = False
         self._owned: Ownership | None = None
         """The folder of the open episode."""
         self._seen: dict[str, deque[int]] = {}
@@ -114,7 +115,6 @@ class RecordingWorker(SessionWorker):
         """Topic -> messages lost in the queue when it was last emptied."""
         self._told_of_loss = False
         """Whether the log has a line about the losses of the present episode."""
-        self._reported_absent = False
         self._whole = 0
         """Complete episodes that were kept."""
         self._provisional = 0
@@ -227,11 +227,9 @@ class RecordingWorker(SessionWorker):
         """
         self._sizes = {}
         self._watch_model()
-        owned = take_next_folder(self._config)
+        owned = take_next_folder(self._config.folder)
         try:
-            start = episode_start(
-                self.session, self._config, owned.path, number=number, stamp_ns=stamp_ns, prompt=prompt
-            )
+            start = episode_start(self.session, owned.path, number=number, stamp_ns=stamp_ns, prompt=prompt)
         except BaseException:
             owned.close()
             raise
@@ -391,7 +389,7 @@ class RecordingWorker(SessionWorker):
             with Ownership(self.kept, "is being deleted", wait_s=0.0):
                 shutil.rmtree(self.kept)
         except (OSError, IbrobotError) as error:
-            self.session.log.warning("the episode that was recorded again stays: %s", error_line(error))
+            self.session.log.warning("the episode that was recorded again stays: %s", error_text(error, "; "))
             return False
         self.written = [each for each in self.written if each.path != self.kept]
         return True
@@ -440,7 +438,7 @@ class RecordingWorker(SessionWorker):
             self._fail(error)
         except Exception as error:  # a plugin's bug must neither end the run nor go unreported
             self.session.log.debug("the recorder failed", exc_info=error)
-            self._fail(RecorderError(f"the recorder {self._config.type!r} failed: {error_line(error)}"))
+            self._fail(RecorderError(f"the recorder {self._config.type!r} failed: {error_text(error, '; ')}"))
         else:
             return True
         return False
@@ -450,7 +448,7 @@ class RecordingWorker(SessionWorker):
         if self.failure is not None:
             return  # report the first failure, not its consequences
         self.failure = error
-        fault = f"recording ended: {error_line(error)}"
+        fault = f"recording ended: {error_text(error, '; ')}"
         session.add_fault(fault)
         ends = session.request.by_operator and session.simulates_episodes
         session.log.error("%s; %s", fault, "the run ends" if ends else "the robot goes on")
@@ -476,7 +474,7 @@ class RecordingWorker(SessionWorker):
             self._of_model = model_topics(self.session.config, self.session.command_source.described())
 
     def _keeps(self, topic: str) -> bool:
-        return topic in self._of_model or is_kept(topic, self._config, self._contract)
+        return topic in self._of_model or is_kept(topic, self._config.topics, self._contract)
 
 
 def _was_pressed(keys: queue.SimpleQueue[str] | None) -> bool:

@@ -26,9 +26,11 @@ from ibrobot_core.api import (
     ns,
     seconds,
 )
-from ibrobot_core.app import TASK_KEY, Align, FrameAssembler, SignalPart, value_at
+from ibrobot_core.app import Align, FrameAssembler, SignalPart
 
 ACTION = "action"
+TASK_KEY = "task"
+"""The key of a signal whose texts replace the prompt."""
 _LONGEST_SILENCE_S = 60
 """Maximum time without a message of any topic [s]; a damaged stamp could otherwise produce years of rows."""
 _ANY_AGE = Align("asof", "receive", 1e12)
@@ -125,7 +127,7 @@ class _Following:
 def _with_tasks(messages: Iterable[Recorded], part: SignalPart, texts: list[str]) -> Iterator[Recorded]:
     """Replace each message by the index of its text in `texts`, to which new ones are added."""
     for item in messages:
-        text = _text_at(item.message, part.path)
+        text = _text_at(item.message, part)
         if text not in texts:
             texts.append(text)
         yield attrs.evolve(item, topic=_source_of(part), message=Int32(texts.index(text)))
@@ -347,10 +349,10 @@ class Ticks:
         )
 
 
-def _text_at(message: Message, path: str) -> str:
-    """The text at a path."""
-    value = value_at(message, path.split("."))
+def _text_at(message: Message, part: SignalPart) -> str:
+    """The text of a signal."""
+    value = part.value(message)
     if isinstance(value, str):
         return value
     there = f"; available: {', '.join(attrs.fields_dict(type(value)))}" if attrs.has(type(value)) else ""
-    raise ContractError(f"{path!r} is not a text in a {message.ros_type}{there}")
+    raise ContractError(f"{part.path!r} is not a text in a {message.ros_type}{there}")

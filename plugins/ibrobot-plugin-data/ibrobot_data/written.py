@@ -10,7 +10,7 @@ from pathlib import Path
 import attrs
 
 from ibrobot_core.api import EpisodeSummary, IbrobotError, seconds
-from ibrobot_core.app import RunView, error_line
+from ibrobot_core.app import RunView, error_text
 from ibrobot_data.plural import plural
 
 
@@ -65,7 +65,7 @@ def read_back(run: RunView, path: Path, stated: str, told: str, lost: Mapping[st
         with closing(run.registry.open_episode(path)) as reader:
             summary = reader.summary()
     except (IbrobotError, OSError) as error:
-        return WrittenEpisode(path, stated, "unknown", whole=False, lost=lost, error=error_line(error))
+        return WrittenEpisode(path, stated, "unknown", whole=False, lost=lost, error=error_text(error, "; "))
     dropped = {topic: each.dropped + each.missing for topic, each in summary.topics.items()}
     return WrittenEpisode(
         path, stated, summary.outcome, summary.finished, {t: n for t, n in dropped.items() if n}, _size(summary)

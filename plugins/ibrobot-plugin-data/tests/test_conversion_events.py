@@ -10,8 +10,9 @@ from ibrobot_data.conversion import EVENTS, Begin, Progress, Report
 from ibrobot_data.recording_session import Session
 from ibrobot_data.request import EpisodeReport
 from ibrobot_data.request import Report as Conversion
+from ibrobot_provenance.asking import read_event
 
-from ibrobot_core.app import Shown, decode_event
+from ibrobot_core.app import Shown
 from ibrobot_core.events import encode_event
 
 
@@ -53,4 +54,4 @@ def test_a_session_tells_how_many_episodes_are_saved(session: Session, shown: Sh
 
 @pytest.mark.parametrize("event", [Begin(2), report(), Session(folder="a", saved=0, wanted=None, state="waiting")])
 def test_events_are_read_as_they_were_written(event: Begin | Report | Session) -> None:
-    assert decode_event(encode_event(event), (*EVENTS, Session)) == event
+    assert read_event(encode_event(event), (*EVENTS, Session)) == event

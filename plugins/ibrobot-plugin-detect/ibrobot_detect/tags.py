@@ -11,8 +11,8 @@ import numpy as np
 from ibrobot_kinematics.poses import homogeneous, matrix, pose, pose_at
 from numpy.typing import NDArray
 
-from ibrobot_core.api import MissingDependency, SensorError, Vector
-from ibrobot_core.app import RunView, install_command
+from ibrobot_core.api import MissingDependency, SensorError, Vector, how_to_install
+from ibrobot_core.app import RunView
 from ibrobot_detect.detector import Detection, Detector, Seen, Sight, box_of, fits
 from ibrobot_detect.options import Tag, TagOptions
 
@@ -21,7 +21,7 @@ try:
 except ModuleNotFoundError:  # there are no wheels for some processors
     raise MissingDependency(
         "the Python package pupil-apriltags is not installed",
-        remedy=f"{install_command(['pupil-apriltags'])} compiles it",
+        remedy=f"{how_to_install('pupil-apriltags')} compiles it",
     ) from None
 
 _SURE = 100.0

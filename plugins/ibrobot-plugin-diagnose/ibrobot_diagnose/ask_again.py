@@ -28,7 +28,7 @@ from ibrobot_core.api import (
     Tensors,
     Transport,
 )
-from ibrobot_core.app import FrameAssembler, RobotConfig, build_policy, from_document, installed_plugins
+from ibrobot_core.app import FrameAssembler, RobotConfig, from_document, installed_plugins
 from ibrobot_diagnose.pictures import Shown, reddened
 from ibrobot_diagnose.window import Asked, Floats, Window
 
@@ -91,7 +91,7 @@ class Model:
         self._requests = itertools.count(1)
         model = config.models[name]
         self.contract = Contract.from_config(config, model.extra_observations)
-        self.policy: Policy = build_policy(config, installed_plugins(), name, self._seed)
+        self.policy: Policy = installed_plugins().build_policy(config, name, self._seed)
         calibration = json.loads(window.metadata.get("calibration", "{}"))
         joined = {joint: numbers for each in calibration.values() for joint, numbers in each.items()}
         mode = model.norm_mode or self.policy.spec.norm_mode or "radians"

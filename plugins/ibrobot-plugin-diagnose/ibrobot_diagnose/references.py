@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import attrs
 
-from ibrobot_core.api import DatasetError, Image, JointState, RecorderError
-from ibrobot_core.app import find_episode, installed_plugins
+from ibrobot_core.api import DatasetError, EpisodeAddress, Image, JointState, RecorderError
+from ibrobot_core.app import installed_plugins
 
 if TYPE_CHECKING:
     from ibrobot_diagnose.card import Card
@@ -33,7 +33,7 @@ def find_episodes(paths: Sequence[Path]) -> list[Path]:
     """
     listed: list[Path] = []
     for path in paths:
-        episode = find_episode(path)
+        episode = EpisodeAddress.find(path)
         if (info := dataset_info(episode)) is not None:
             listed += [episode.with_name(f"{episode.name}:{number}") for number in range(info["total_episodes"])]
             continue

@@ -21,7 +21,7 @@ import numpy as np
 from ibrobot_provenance.asking import Choice
 
 from ibrobot_core.api import IbrobotError, seconds
-from ibrobot_core.app import LaunchRequest, LogFormatter, Runtime, Session, end_signals, error_line, installed_plugins
+from ibrobot_core.app import LaunchRequest, LogFormatter, Runtime, Session, end_signals, error_text, installed_plugins
 from ibrobot_eval.cameras import StartPictures, cameras_of, live_pictures
 from ibrobot_eval.comparison import Decision
 from ibrobot_eval.episodes import SCRATCH, Result, interventions, recorded_in
@@ -241,7 +241,7 @@ class Blinded:
         try:
             trial = self._run(number, block, place, self._policies[label], starts)
         except IbrobotError as error:
-            failed = self._blinding(f"trial {number} did not run: {error_line(error)}")
+            failed = self._blinding(f"trial {number} did not run: {error_text(error, '; ')}")
             operator.ask(failed, (Choice(key="enter", text="try again"), QUIT))
             return
         outcome = trial.outcome or _KEYS[operator.ask(f"trial {number} has ended", (*_JUDGE, QUIT))]

@@ -22,7 +22,6 @@ from ibrobot_core.app import (
     RobotConfig,
     Runtime,
     Session,
-    build_policy,
     installed_plugins,
 )
 from ibrobot_eval.limits import Attempt, EpisodeTooLong
@@ -234,7 +233,7 @@ def without_unseen_pictures(config: RobotConfig, model: str) -> RobotConfig:
     assert config.recording is not None
     if config.recording.topics != "contract":
         return config
-    seen = build_policy(config, installed_plugins(), model).spec.observations
+    seen = installed_plugins().build_policy(config, model).spec.observations
     contract = Contract.from_config(config, config.models[model].extra_observations)
     unseen = {each.topic for each in contract.observation_parts if each.image is not None}
     unseen -= {each.topic for each in contract.observation_parts if each.key in seen}

@@ -16,7 +16,6 @@ from ibrobot_core.app import (
     RobotConfig,
     Runtime,
     Session,
-    absent_sensors,
     find_config,
     installed_plugins,
     load_config,
@@ -32,7 +31,7 @@ _DEPTH = 10_000
 def can_film(policy: Policy) -> bool:
     """Whether the simulation of a policy has a camera for films, and this machine can render."""
     config = _filmed(policy, None)
-    return config is not None and all(each.name != _CAMERA for each in absent_sensors(config, installed_plugins()))
+    return config is not None and all(each.name != _CAMERA for each in installed_plugins().absent_sensors(config))
 
 
 def _filmed(policy: Policy, seed: int | None) -> RobotConfig | None:

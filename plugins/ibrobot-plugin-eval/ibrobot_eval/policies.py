@@ -20,7 +20,6 @@ from ibrobot_core.app import (
     Registry,
     RequestError,
     RobotConfig,
-    build_policy,
     find_config,
     installed_plugins,
     load_config,
@@ -195,7 +194,7 @@ def identify(policy: Policy, registry: Registry) -> Identity:
     """
     robot = policy.load()
     model = robot.models[policy.model]
-    made = build_policy(robot, registry, policy.model)
+    made = registry.build_policy(robot, policy.model)
     described = robot.robot.description
     named = [each for each in (described.mjcf, described.urdf) if each is not None]
     named += [Path(value) for value in _leaves(attrs.asdict(model.options)) if isinstance(value, str | Path) and value]

@@ -18,9 +18,9 @@ from ibrobot_feetech.emulator.mechanics import Mechanics, mechanics_of
 from ibrobot_feetech.ticks import TICKS_PER_RADIAN
 from ibrobot_terminal.fakes import FakeGuide
 from ibrobot_terminal.guide import Cells
+from ibrobot_terminal.questions import Declined
 
 from ibrobot_core.api import CalibrationError, HardwareError, IbrobotError
-from ibrobot_core.app import Declined
 
 from .line import Line
 

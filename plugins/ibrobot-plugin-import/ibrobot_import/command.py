@@ -11,16 +11,14 @@ from uuid import uuid4
 
 import attrs
 
-from ibrobot_core.api import option
+from ibrobot_core.api import how_to_install, option
 from ibrobot_core.app import (
     ConfigError,
     Problem,
     contract_alone,
     echo,
-    install_command,
     installed_plugins,
     load_config,
-    official_plugins,
     parse_yaml,
     read_document,
 )
@@ -192,15 +190,16 @@ def _check(converted: Imported, draft: Path, source: Path, out: Path) -> str:
     except ConfigError as error:
         if packages := _lacking(converted):
             at_out = ConfigError(attrs.evolve(each, file=str(out)) for each in error.problems)
-            return f"{at_out}; not all could be checked: {install_command(packages)}, then `ibrobot config check {out}`"
+            return f"{at_out}; not all could be checked: {how_to_install(*packages)}, then `ibrobot config check {out}`"
         raise ConfigError(_at_the_source(each, converted.draft, source) for each in error.problems) from None
     return ""
 
 
 def _lacking(converted: Imported) -> list[str]:
     """The packages of the hardware, the simulation and the recorder that are not installed."""
-    lacking = [each for each in converted.types if each not in installed_plugins().entries]
-    return [name for name, offers in official_plugins().items() if any(t in offers.get(k, ()) for k, t in lacking)]
+    registry = installed_plugins()
+    lacking = [each for each in converted.types if each not in registry.entries]
+    return [package for kind, type_ in lacking if (package := registry.official(kind).get(type_)) is not None]
 
 
 def _at_the_source(problem: Problem, draft: Draft, source: Path) -> Problem:

@@ -9,10 +9,9 @@ import attrs
 from ibrobot_provenance.option_schemas import OptionSchemas, Schema
 
 from ibrobot_core.app import (
-    SECTIONS,
     ComponentConfig,
     Registry,
-    component_of,
+    RobotConfig,
     echo,
     fields,
     installed_plugins,
@@ -33,7 +32,7 @@ class PrintSchema:
 def json_schema(registry: Registry) -> Schema:
     """The schema of the whole file."""
     schemas = _Schemas(registry)
-    schema = schemas.of_fields(SECTIONS)
+    schema = schemas.of_fields(RobotConfig.sections())
     for name in registry.types("section"):
         section = registry.find("section", name)
         schema["properties"][name] = {**schemas.of_fields(fields(section.options)), "description": section.summary}
@@ -53,7 +52,7 @@ class _Schemas(OptionSchemas):
 
     @override
     def of_union(self, kind: Any) -> Schema:
-        if (component := component_of(kind)) is not None:  # without null, editors mark errors in it more precisely
+        if (component := ComponentConfig.within(kind)) is not None:
             return self._of_component(component)
         return super().of_union(kind)
 
@@ -61,7 +60,7 @@ class _Schemas(OptionSchemas):
     def of_mapping(self, kind: Any) -> Schema:
         several = super().of_mapping(kind)
         item = (*get_args(kind), Any, Any)[1]
-        if (component := component_of(item)) is not None and component.may_be_alone:
+        if (component := ComponentConfig.within(item)) is not None and component.may_be_alone:
             return {"if": {"required": ["type"]}, "then": several["additionalProperties"], "else": several}
         return several
 

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_terminal.questions import Declined, confirm
 
 from ibrobot_core.api import HardwareError, did_you_mean, option
-from ibrobot_core.app import Declined, RequestError, confirm, echo, wrong_input
+from ibrobot_core.app import RequestError, echo, wrong_input
 from ibrobot_lerobot_devices.link import DeviceLink, DeviceProblem
 from ibrobot_lerobot_devices.registry import registry
 from ibrobot_lerobot_devices.units import OTHERS, UNITS

@@ -21,7 +21,6 @@ from ibrobot_core.api import (
     Message,
     ObservationPart,
 )
-from ibrobot_core.app import Leaf
 
 _ACTION = "action"
 _DEPTH: Mapping[str, type[np.generic]] = {"16UC1": np.uint16, "32FC1": np.float32}
@@ -54,7 +53,7 @@ class Composer:
         self._topics: dict[str, list[ObservationPart]] = {}
         for part in contract.observation_parts:
             self._topics.setdefault(part.topic, []).append(part)
-        self._leaves = {id(part): _leaves(part) for part in contract.observation_parts if part.image is None}
+        self._places = {id(part): _places(part) for part in contract.observation_parts if part.image is None}
         for key in contract.observations:
             unknown = [part for part in contract.parts(key) if part.image is None and part.feature.shape == (-1,)]
             if len(unknown) > 1:
@@ -88,14 +87,15 @@ class Composer:
         first = parts[0]
         if first.image is not None:
             return _image(first, values[first.key], header)
-        pairs: list[tuple[Leaf, Any]] = []
+        found: list[tuple[str, str, Any]] = []
         for part in parts:
-            leaves, vector = self._leaves[id(part)], self._slice(part, values[part.key])
-            pairs += [(leaves[0], vector)] if leaves[0].kind == "array" else zip(leaves, vector.tolist(), strict=True)
+            places, vector = self._places[id(part)], self._slice(part, values[part.key])
+            given = [vector] if part.selection.size < 0 else vector.tolist()
+            found += [(*place, value) for place, value in zip(places, given, strict=True)]
         message_type = MESSAGE_TYPES[first.type]
         if message_type is JointState:
-            return _joint_state(pairs, header)
-        message: Message = _build(message_type, "", _fields(pairs), header)
+            return _joint_state(found, header)
+        message: Message = _build(message_type, "", _fields(found), header)
         return message
 
     def _action(self, vector: NDArray[Any]) -> dict[str, Message]:
@@ -128,7 +128,8 @@ class Composer:
         raise AssertionError(part)
 
 
-def _leaves(part: ObservationPart) -> tuple[Leaf, ...]:
+def _places(part: ObservationPart) -> list[tuple[str, str]]:
+    """Field of each number of a part, and its element or joint; empty for a number or a whole array."""
     if part.type not in MESSAGE_TYPES:
         raise ContractError(f"{part.key}: cannot make a {part.type}, because only the original bags define this type")
     leaves = part.selection.leaves
@@ -138,7 +139,7 @@ def _leaves(part: ObservationPart) -> tuple[Leaf, ...]:
         )
     if len(leaves) > 1 and any(leaf.kind == "array" for leaf in leaves):
         raise ContractError(f"{part.key}: the position of {', '.join(part.select)} in the vector is unknown")
-    return leaves
+    return [(leaf.field, leaf.part) for leaf in leaves]
 
 
 def _image(part: ObservationPart, array: NDArray[Any], header: Header) -> Image:
@@ -153,26 +154,26 @@ def _image(part: ObservationPart, array: NDArray[Any], header: Header) -> Image:
     return Image(header, height, width, encoding, rows.shape[1], rows.reshape(-1))
 
 
-def _joint_state(pairs: list[tuple[Leaf, Any]], header: Header) -> JointState:
-    names = tuple(dict.fromkeys(leaf.part for leaf, _ in pairs))
+def _joint_state(found: list[tuple[str, str, Any]], header: Header) -> JointState:
+    names = tuple(dict.fromkeys(joint for _, joint, _ in found))
     arrays: dict[str, NDArray[np.float64]] = {}
-    for leaf, value in pairs:
-        array = arrays.setdefault(leaf.field, np.full(len(names), np.nan))
-        array[names.index(leaf.part)] = value
+    for field, joint, value in found:
+        array = arrays.setdefault(field, np.full(len(names), np.nan))
+        array[names.index(joint)] = value
     return JointState(header, names, **arrays)
 
 
-def _fields(pairs: list[tuple[Leaf, Any]]) -> dict[str, Any]:
+def _fields(found: list[tuple[str, str, Any]]) -> dict[str, Any]:
     """Path -> value, with elements combined into arrays."""
     known: dict[str, Any] = {}
-    for leaf, value in pairs:
-        if leaf.kind != "element":
-            known[leaf.field] = value
+    for field, element, value in found:
+        if not element:
+            known[field] = value
             continue
-        index = int(leaf.part)
-        array = known.get(leaf.field, np.empty(0))
-        known[leaf.field] = np.pad(array, (0, max(0, index + 1 - len(array))), constant_values=np.nan)
-        known[leaf.field][index] = value
+        index = int(element)
+        array = known.get(field, np.empty(0))
+        known[field] = np.pad(array, (0, max(0, index + 1 - len(array))), constant_values=np.nan)
+        known[field][index] = value
     return known
 
 

@@ -15,8 +15,7 @@ from lerobot.policies.factory import get_policy_class
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from numpy.typing import NDArray
 
-from ibrobot_core.api import PolicyError, Tensors
-from ibrobot_core.app import check_finite
+from ibrobot_core.api import Policy, PolicyError, Tensors
 from ibrobot_lerobot.attention import Attention
 from ibrobot_lerobot.checkpoint import ACTION, ATTENTION, Checkpoint
 from ibrobot_lerobot.draws import Draw, Draws, NotByRequest
@@ -99,7 +98,7 @@ class PolicyModel:
                 f"a chunk has (1, up to {length}, {size})"
             )
         hint = f" ({self._autocast}; bfloat16 and float32 have a larger range)" if self._autocast is not None else ""
-        check_finite(f"{self._checkpoint.path}: infer of its first run{hint}", {ACTION: action})
+        Policy.check_finite(f"{self._checkpoint.path}: infer of its first run{hint}", {ACTION: action})
         return action
 
     def predict(self, batch: Sequence[Tensors]) -> list[dict[str, NDArray[np.float32]]]:

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Context, Frame, Header, Image, PictureCodec, Policy, PolicyError, PolicySpec, Tensors
-from ibrobot_core.app import check_finite
 from ibrobot_lerobot.checkpoint import (
     ACTION,
     ATTENTION,
@@ -103,7 +102,7 @@ class LeRobotPolicy(Policy):
             model = _import("model").PolicyModel(self._checkpoint, self._options, self._pre, self._pictures, log)
             tensors = self.preprocess(self._typical())
             actions = self.postprocess({ACTION: model.warm_up(tensors)})
-        check_finite(f"{self._options.path}: postprocess of its first run", {ACTION: actions})
+        Policy.check_finite(f"{self._options.path}: postprocess of its first run", {ACTION: actions})
         # The length of a text, and the output of LeRobot's own steps for it, are not known in advance.
         self._expected = {
             name: (array.dtype, (-1,) * array.ndim if self._pre.others and name != SEED else array.shape)

@@ -21,13 +21,14 @@ from ibrobot_lerobot import trainer as lerobot_train
 from ibrobot_lerobot.trainer import arguments, progress
 from ibrobot_lerobot.training import EVENTS, Begin, Progress, Report, TrainOptions
 from ibrobot_lerobot.training_checkpoints import newest_checkpoint
+from ibrobot_provenance.asking import read_event
 from ibrobot_provenance.ownership import InUse
 from ibrobot_testing import ibrobot_command
 from ibrobot_testing.command import command_line
 from trainer import install
 
 from ibrobot_core.api import DatasetError, Feature, MissingDependency
-from ibrobot_core.app import RequestError, Shown, decode_event
+from ibrobot_core.app import RequestError, Shown
 
 from .conftest import CAMERA, FPS, rows, write
 
@@ -98,7 +99,7 @@ def test_what_is_shown_of_a_training() -> None:
 
 def test_the_time_left_is_known_after_two_reports(dataset: Path, tmp_path: Path) -> None:
     lines = run(train, dataset, "--out", tmp_path / "out", "--steps", 10, "--events", "--pause=0.01")
-    steps = [event for line in lines if isinstance(event := decode_event(line, EVENTS), Progress)]
+    steps = [event for line in lines if isinstance(event := read_event(line, EVENTS), Progress)]
     assert [each.left_s is None for each in steps] == [True, *[False] * 9]
     assert steps[-1].left_s == 0.0
 

@@ -11,9 +11,10 @@ from typing import Any
 
 import attrs
 from ibrobot_terminal.agent_calls import AskedPath
+from ibrobot_terminal.questions import confirm
 
 from ibrobot_core.api import IbrobotError, option
-from ibrobot_core.app import RequestError, confirm, echo
+from ibrobot_core.app import RequestError, echo
 from ibrobot_mcp.persons import ASKED, MOVING, ask, running, sockets_folder
 from ibrobot_mcp.tokens import add_token, named_agents, remove_token
 

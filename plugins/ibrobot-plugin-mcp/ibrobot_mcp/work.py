@@ -14,11 +14,12 @@ from types import NoneType
 from typing import Any
 
 import attrs
+from ibrobot_provenance.asking import read_event
 from ibrobot_provenance.processes import Job, Jobs, arguments
 from ibrobot_provenance.reports import Case, Cases, Plots, ReportSection, Table, Text, kinds_of_reports
 from ibrobot_provenance.work import Work, Workplace
 
-from ibrobot_core.api import IbrobotError, MissingDependency, option
+from ibrobot_core.api import EpisodeAddress, IbrobotError, MissingDependency, option
 from ibrobot_core.app import (
     Command,
     Failed,
@@ -26,10 +27,8 @@ from ibrobot_core.app import (
     RequestError,
     RunView,
     Service,
-    decode_event,
     dump_yaml,
     error_text,
-    find_episode,
     installed_plugins,
 )
 from ibrobot_mcp.audit import states_folder
@@ -111,7 +110,7 @@ class Places:
         open_to_all = [*self.kept(), *([] if self.root is None else [self.root])]
         for top in self._tops:
             with suppress(OSError, RuntimeError):  # a name that is too long, or links in a circle
-                path = find_episode(top / text).resolve()
+                path = EpisodeAddress.find(top / text).resolve()
                 there = path.exists() or path.with_name(path.name.rpartition(":")[0] or path.name).exists()
                 if there and any(path.is_relative_to(each) for each in open_to_all):
                     return path
@@ -247,7 +246,7 @@ class WorkServices:
 
 def _facts(command: Command, line: str) -> Mapping[str, Any] | None:
     """What an event in a line of output says; None for other lines."""
-    event = decode_event(line, (*command.events, Failed))
+    event = read_event(line, command.events)
     if event is None:
         return None
     shown = event.shown()

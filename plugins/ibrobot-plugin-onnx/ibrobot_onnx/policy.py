@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Context, Frame, Policy, PolicyError, PolicySpec, Tensors
-from ibrobot_core.app import check_finite
 from ibrobot_onnx.manifest import NOISE, Manifest, Noise, read_manifest, stacked_shape
 from ibrobot_onnx.options import PROVIDERS, OnnxPolicyOptions
 
@@ -89,10 +88,10 @@ class OnnxPolicy(Policy):
                 f"{self._options.path}: the graph returns actions of shape {chunk.shape}; {manifest.path.name} states "
                 f"{manifest.action_size} values in at least {least} actions"
             )
-        check_finite(f"{self._options.path}: infer of its first run", {ACTION: chunk})
+        Policy.check_finite(f"{self._options.path}: infer of its first run", {ACTION: chunk})
         with np.errstate(all="ignore"):  # the check names it
             actions = self.postprocess({ACTION: chunk})
-        check_finite(f"{self._options.path}: postprocess of its first run", {ACTION: actions})
+        Policy.check_finite(f"{self._options.path}: postprocess of its first run", {ACTION: actions})
         self._sessions, self._weights = sessions, digest.hexdigest()[:32]
         self._identity = f"onnxruntime {version('onnxruntime')}, {sessions[0].get_providers()[0]}"
         self._log.info("%s on %s", manifest.type, sessions[0].get_providers()[0])

@@ -27,7 +27,7 @@ from ibrobot_core.api import (
     nan_vector,
     ns,
 )
-from ibrobot_core.app import error_line
+from ibrobot_core.app import error_text
 from ibrobot_ros.options import Ros2ControlOptions
 from ibrobot_ros.process import NodeProcess
 
@@ -72,7 +72,7 @@ class Ros2Control(Hardware):
         try:
             node = self._node = NodeProcess(options, f"ibrobot_{self._ctx.name}")
         except IbrobotError as error:
-            raise HardwareError(error_line(error)) from error
+            raise HardwareError(error_text(error, "; ")) from error
         types = {"positions": Float64MultiArray.ros_type, "trajectory": JointTrajectory.ros_type}
         node.channel.send({"op": "publisher", "topic": self._topic, "type": types[options.command], "qos": "default"})
         states = {"topic": options.states, "type": JointState.ros_type, "qos": "default", "rate_hz": _RATE_HZ}

@@ -13,7 +13,7 @@ from ibrobot_ros2.calls import GoalRequest
 from ibrobot_ros2.goals import Actions, with_goals
 
 from ibrobot_core.api import DiagnosticArray, DiagnosticStatus, Header, KeyValue, NotSupported
-from ibrobot_core.app import CONTROL, Channel, ChannelMessage, Component, ComponentFailed, GoalRun, Pulse, error_line
+from ibrobot_core.app import CONTROL, Channel, ChannelMessage, Component, ComponentFailed, GoalRun, Pulse, error_text
 from ibrobot_ros.options import RosOptions
 from ibrobot_ros.process import NodeProcess
 from ibrobot_ros.services import Services
@@ -236,7 +236,7 @@ class RosNode(Component):
         try:
             self._node = self._new_node(self._ending)
         except Exception as error:  # noqa: BLE001 - reported, and tried again
-            self._trouble = f"the ROS node does not start: {error_line(error)}"
+            self._trouble = f"the ROS node does not start: {error_text(error, '; ')}"
             self._session.log.error("ros: %s", self._trouble)
             return
         self._begun_s = time.monotonic()

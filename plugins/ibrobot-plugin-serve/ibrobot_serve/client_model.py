@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Frame, Policy, PolicyError
-from ibrobot_core.app import check_finite
 
 _WORDS = {"actions": "joints", "rate_hz": "rate"}
 """Key that a model may leave unknown -> word for it in messages."""
@@ -83,15 +82,15 @@ class ClientModel:
         """
         begun_s = time.perf_counter()
         frame = _frame(values, prompt, self.policy)
-        check_finite("the request", frame.values)
+        Policy.check_finite("the request", frame.values)
         with self._turn:
             tensors = self.policy.preprocess(frame)
-            check_finite("the policy's preprocess", tensors)
+            Policy.check_finite("the policy's preprocess", tensors)
             outputs = self.policy.infer(tensors)
-            check_finite("the policy's infer", outputs)
+            Policy.check_finite("the policy's infer", outputs)
             with np.errstate(over="ignore"):  # the check names it
                 actions = self.policy.postprocess(outputs).astype(np.float32)
-        check_finite("the policy's postprocess", {"actions": actions})
+        Policy.check_finite("the policy's postprocess", {"actions": actions})
         self.answered += 1
         return actions, (time.perf_counter() - begun_s) * 1e3
 

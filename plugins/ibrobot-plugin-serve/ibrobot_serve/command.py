@@ -25,10 +25,7 @@ from ibrobot_core.app import (
     Registry,
     RequestError,
     RobotConfig,
-    apply_overrides,
-    build_policy,
     echo,
-    example_type,
     find_config,
     installed_plugins,
     load_config,
@@ -194,7 +191,7 @@ def _from_config(options: Serve, registry: Registry) -> tuple[str, Policy, Calla
     if section is None or section.type == "local":
         raise RequestError(
             f"{path} names no transport to robots: add "
-            f"--set 'transport={{type: {example_type('transport')}}}' --listen ENDPOINT"
+            f"--set 'transport={{type: {next(iter(registry.official('transport')))}}}' --listen ENDPOINT"
         )
     make = partial(registry.find("transport", section.type).make, section.options, _context(config.robot))
     return *served, make
@@ -230,7 +227,7 @@ def _of_config(options: Serve, config: RobotConfig, path: Path, registry: Regist
     model: str = options.model or (next(iter(config.models)) if len(config.models) == 1 else "")
     if model not in config.models:
         raise RequestError(f"--model: one of {', '.join(config.models) or 'none'} in {path}, got {options.model}")
-    return options.name or model, build_policy(config, registry, model)
+    return options.name or model, registry.build_policy(config, model)
 
 
 def _serve_clients(options: Serve, registry: Registry) -> None:
@@ -283,8 +280,7 @@ def _host_and_port(listen: Sequence[str], key: str | None, usual: int = 8000) ->
 
 def _transport_type(path: Path, overrides: Sequence[str]) -> str:
     """The type in the `transport` section, read before any checks; empty if there is none."""
-    document = read_document(path)
-    apply_overrides(document, overrides)
+    document = read_document(path, overrides)
     type_name = str(document.get("transport", "type") or "")
     return "" if type_name == "local" else type_name
 

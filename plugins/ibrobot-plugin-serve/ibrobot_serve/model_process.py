@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ibrobot_core.api import Policy
-from ibrobot_core.app import Channel, build_policy, error_text, from_document, installed_plugins, run_child
+from ibrobot_core.app import Channel, error_text, from_document, installed_plugins, run_child
 from ibrobot_serve.wire import WIRE_LIMITS, WireDecoder, WireEncoder, WireKind, WireMessage
 
 _GLANCE_S = 0.5
@@ -67,7 +67,7 @@ def run(channel: Channel, order: Mapping[str, Any], request: int, answer: int) -
     threading.Thread(target=_end_with, args=(order["host"],), daemon=True).start()
     registry = installed_plugins()
     config = from_document(order["document"], source=Path(order["source"]), sim=order["sim"], registry=registry)
-    policy = build_policy(config, registry, order["model"], order["seed"])
+    policy = registry.build_policy(config, order["model"], order["seed"])
     try:
         policy.load()
         channel.send({

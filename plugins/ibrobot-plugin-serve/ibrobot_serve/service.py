@@ -19,7 +19,7 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import NS_PER_S, IbrobotError, Payload, PictureCodec, Policy, PolicyError, Tensors, Transport
-from ibrobot_core.app import WireError, check_finite
+from ibrobot_core.app import WireError
 from ibrobot_serve.fair_queue import FairQueue
 from ibrobot_serve.pacing import Pacing
 from ibrobot_serve.results import Results
@@ -303,7 +303,7 @@ class InferenceService:
 
     def _wait_for(self, message: WireMessage, arrived_ns: int) -> _Outcome:
         try:
-            check_finite("the request", message.tensors)
+            Policy.check_finite("the request", message.tensors)
         except PolicyError as error:
             return _Outcome(None, str(error))
         patience_ns = min(message.deadline_ns, round(_LONGEST_WAIT_S * NS_PER_S))
@@ -333,7 +333,7 @@ class InferenceService:
         error, reply, broken = outcome.error, None, outcome.model
         if outcome.outputs is not None:
             try:
-                check_finite("infer", outcome.outputs)
+                Policy.check_finite("infer", outcome.outputs)
                 reply = encoded(WireKind.ANSWER, outcome.outputs)
             except (PolicyError, WireError) as invalid:
                 error, broken = f"the policy's outputs: {invalid}", True

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from ibrobot_web.modes import modes_json
 
-from ibrobot_core.app import find_config, installed_plugins, load_config, shipped_configs
+from ibrobot_core.app import find_config, installed_plugins, load_config
 
 REGISTRY = installed_plugins()
-SHIPPED = sorted(shipped_configs(REGISTRY))
+SHIPPED = sorted(REGISTRY.shipped_configs())
 pytestmark = [
     pytest.mark.integration,
     pytest.mark.skipif(("hardware", "mujoco") not in REGISTRY.entries, reason="needs ibrobot-plugin-mujoco"),

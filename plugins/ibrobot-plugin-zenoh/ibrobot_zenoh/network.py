@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import attrs
 from ibrobot_ros2.interfaces import ServiceType
 from ibrobot_ros2.workers import StopWay
 
 from ibrobot_core.api import Message, Payload, Transport
-from ibrobot_core.app import TransportLink
 
 type UrgentHandler = Callable[[Payload, str | None, int], Payload]
 """As `Handler`; the last argument is when the request was sent, by the sender's time of day [ns], 0 if unknown."""
@@ -113,7 +112,17 @@ class TopicTransport(Transport):
         """
 
 
-def transport_of(link: TransportLink) -> TopicTransport:
+class Link(Protocol):
+    """The run's transport, for components that need `name`: it is open when they start."""
+
+    name: str
+
+    @property
+    def transport(self) -> Transport:
+        """It."""
+
+
+def transport_of(link: Link) -> TopicTransport:
     """The transport of a link, which carries messages."""
     transport = link.transport
     assert isinstance(transport, TopicTransport)

@@ -14,7 +14,8 @@ from ibrobot_core.api import Late, OptionFault, Options, did_you_mean, documente
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
-    from ibrobot_core.app import Component, RunView, TransportLink
+    from ibrobot_core.app import Component, RunView
+    from ibrobot_zenoh.network import Link
 
 MIB = 1024 * 1024
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
@@ -254,7 +255,7 @@ class ZenohOptions(Options):
         """Whether it shares anything."""
         return self.share != Share()
 
-    def components(self, run: RunView, link: TransportLink) -> Sequence[Component]:
+    def components(self, run: RunView, link: Link) -> Sequence[Component]:
         """What shares topics, services and actions."""
         shared: Sequence[Component] = Late("ibrobot_zenoh.sharing:components")(self.share, run, link)
         return shared

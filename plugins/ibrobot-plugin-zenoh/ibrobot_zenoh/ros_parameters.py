@@ -10,9 +10,9 @@ from typing import Any, override
 from ibrobot_ros2.interfaces import service_type
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import Component, RunView, TransportLink, dump_yaml
+from ibrobot_core.app import Component, RunView, dump_yaml
 from ibrobot_zenoh.arrivals import Arrivals
-from ibrobot_zenoh.network import Reply, transport_of
+from ibrobot_zenoh.network import Link, Reply, transport_of
 
 _SET_MODE = "/set_mode"
 MODE = "mode"
@@ -95,7 +95,7 @@ class RosParameters(Component):
     """
 
     def __init__(
-        self, session: RunView, link: TransportLink, is_shared: Callable[[str], bool], arrivals: Arrivals
+        self, session: RunView, link: Link, is_shared: Callable[[str], bool], arrivals: Arrivals
     ) -> None:  # fmt: skip
         super().__init__("share:parameters", "this file as parameters", (link.name,))
         self._session = session

@@ -17,9 +17,9 @@ from ibrobot_ros2.offers import CHECK, Offer, Offers, refused, time_of
 from ibrobot_ros2.workers import StopWay
 
 from ibrobot_core.api import NS_PER_S, HardwareError, IbrobotError, NotSupported, did_you_mean
-from ibrobot_core.app import CONTROL, GoalRun, SessionWorker, TransportLink
+from ibrobot_core.app import CONTROL, GoalRun, SessionWorker
 from ibrobot_zenoh.arrivals import Arrivals
-from ibrobot_zenoh.network import Reply, RosHandler, transport_of
+from ibrobot_zenoh.network import Link, Reply, RosHandler, transport_of
 from ibrobot_zenoh.options import Share
 from ibrobot_zenoh.ros2 import absolute
 from ibrobot_zenoh.ros_goals import Status
@@ -79,7 +79,7 @@ class RosSharing(SessionWorker):
 
     session: GoalRun
 
-    def __init__(self, session: GoalRun, link: TransportLink, share: Share, arrivals: Arrivals) -> None:
+    def __init__(self, session: GoalRun, link: Link, share: Share, arrivals: Arrivals) -> None:
         super().__init__(session, "share:ros", "services and actions for ROS 2 nodes", (link.name, CONTROL))
         self._link = link
         self._arrivals = arrivals

@@ -20,9 +20,9 @@ from ibrobot_ros2.services import (
 from ibrobot_ros2.workers import StopWay
 
 from ibrobot_core.api import IbrobotError, NotSupported, Payload, TransportError, did_you_mean
-from ibrobot_core.app import Component, RunView, TransportLink, described, type_name
+from ibrobot_core.app import Component, RunView, described, type_name
 from ibrobot_zenoh.arrivals import Arrivals
-from ibrobot_zenoh.network import transport_of
+from ibrobot_zenoh.network import Link, transport_of
 from ibrobot_zenoh.options import Share
 
 _STOP, _CHECK = "/estop", "/estop/check"
@@ -41,7 +41,7 @@ class SharedServices(Component):
     and `/rosapi/service_request_details` describes one.
     """
 
-    def __init__(self, session: RunView, link: TransportLink, share: Share, arrivals: Arrivals) -> None:
+    def __init__(self, session: RunView, link: Link, share: Share, arrivals: Arrivals) -> None:
         super().__init__("share:services", f"{', '.join(share.services)} for other machines", (link.name,))
         self._session = session
         self._link = link

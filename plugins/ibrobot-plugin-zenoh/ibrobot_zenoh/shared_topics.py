@@ -7,8 +7,8 @@ from contextlib import ExitStack
 from typing import override
 
 from ibrobot_core.api import NS_PER_S, IbrobotError, Message, did_you_mean
-from ibrobot_core.app import Component, RunView, SessionWorker, Subscription, TransportLink
-from ibrobot_zenoh.network import transport_of
+from ibrobot_core.app import Component, RunView, SessionWorker, Subscription
+from ibrobot_zenoh.network import Link, transport_of
 
 _DEPTH = 10
 """Queue size of a topic for the network; when it is full, the bus drops and counts the oldest message."""
@@ -19,7 +19,7 @@ _SILENT_NS = 5 * NS_PER_S
 class PublishedTopic(SessionWorker):
     """Sends a topic of the bus to other machines. Messages that cannot be sent are skipped and reported once."""
 
-    def __init__(self, session: RunView, link: TransportLink, topic: str) -> None:
+    def __init__(self, session: RunView, link: Link, topic: str) -> None:
         super().__init__(session, f"share:{topic}", "to other machines", (link.name,))
         self._link = link
         self._topic = topic
@@ -64,7 +64,7 @@ class PublishedTopic(SessionWorker):
 class SubscribedTopics(Component):
     """Forwards topics of other machines to the bus."""
 
-    def __init__(self, session: RunView, link: TransportLink, topics: Collection[str] | Mapping[str, str]) -> None:
+    def __init__(self, session: RunView, link: Link, topics: Collection[str] | Mapping[str, str]) -> None:
         super().__init__("share", f"{', '.join(topics)} from other machines", (link.name,))
         self._link = link
         self._session = session

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from ibrobot_core.api import NotSupported
-from ibrobot_core.app import Component, GoalRun, TransportLink
+from ibrobot_core.app import Component, GoalRun
 from ibrobot_zenoh.arrivals import Arrivals
+from ibrobot_zenoh.network import Link
 from ibrobot_zenoh.options import Share
 from ibrobot_zenoh.ros_parameters import RosParameters
 from ibrobot_zenoh.ros_sharing import RosSharing
@@ -12,7 +13,7 @@ from ibrobot_zenoh.shared_services import SharedServices
 from ibrobot_zenoh.shared_topics import PublishedTopic, SubscribedTopics
 
 
-def components(share: Share, session: GoalRun, link: TransportLink) -> list[Component]:
+def components(share: Share, session: GoalRun, link: Link) -> list[Component]:
     """The components that share the topics and services in a YAML.
 
     Raises:

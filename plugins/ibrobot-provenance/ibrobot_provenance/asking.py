@@ -1,11 +1,15 @@
-"""Questions of jobs to an operator, as events of a command, and their answers."""
+"""What commands tell the programs that started them: their events, and among these questions to an operator."""
 
 from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
 
 import attrs
 
 from ibrobot_core.api import option
-from ibrobot_core.app import Event
+from ibrobot_core.app import Event, Failed, RequestError, WireError, read_options
 
 
 @attrs.frozen(kw_only=True)
@@ -45,3 +49,27 @@ class Answer:
 
     ask: int = option(help="number of the question")
     answer: str = option(help="key of the choice, or the text")
+
+
+def read_event(line: str, events: Sequence[type[Event]]) -> Event | None:
+    """The event in a line of a command's output; None for other output.
+
+    Args:
+        line: the line.
+        events: the classes of events that the command declares; `Failed` is one of every command's.
+
+    Raises:
+        WireError: for an event of no such class, or of another shape.
+    """
+    if not line.startswith('{"event": '):
+        return None
+    known = {kind.__name__.lower(): kind for kind in (*events, Failed)}
+    try:
+        facts = json.loads(line)
+        name = str(facts.pop("event"))
+        if name not in known:
+            raise WireError(f"unknown event {name!r}; declared: {', '.join(known)}")
+        event: Event = read_options(known[name], facts, Path, {})
+    except (ValueError, RecursionError, RequestError) as error:
+        raise WireError(f"malformed event: {error}: {line[:200]}") from None
+    return event

@@ -21,7 +21,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ibrobot_core import api
 from ibrobot_core.api import Descriptor, Late, did_you_mean, how_to_install, option
-from ibrobot_core.app import Registry, RequestError, echo, installed_plugins, official_plugins
+from ibrobot_core.app import Registry, RequestError, echo, installed_plugins
 from ibrobot_kit.excerpt import excerpt
 from ibrobot_kit.imports import arranged
 from ibrobot_kit.repository import Repository
@@ -188,7 +188,7 @@ def render(kind: str, name: str, *, outside: bool = True) -> dict[str, str]:
 def _begun(registry: Registry, kind: str) -> Late:
     """The place of what a package of a kind begins with."""
     if (SAMPLE, kind) not in registry.entries:
-        if any(kind in offers.get(SAMPLE, ()) for offers in official_plugins().values()):
+        if kind in registry.official(SAMPLE):
             raise registry.not_found(SAMPLE, kind)
         raise RequestError(f"KIND is {kind!r}{did_you_mean(kind, registry.types(SAMPLE), 'kinds')}")
     place = registry.find(SAMPLE, kind).make

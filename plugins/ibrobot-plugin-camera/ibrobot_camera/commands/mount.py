@@ -21,16 +21,7 @@ from ibrobot_camera.mounting.fit import Session
 from ibrobot_camera.mounting.solve import Mounting, solve_mount
 from ibrobot_camera.options import OpenCvOptions
 from ibrobot_core.api import CameraInfo, Header, IbrobotError, SensorError, Vector, option
-from ibrobot_core.app import (
-    RequestError,
-    RobotConfig,
-    echo,
-    find_config,
-    installed_plugins,
-    load_config,
-    shipped_configs,
-    wrong_input,
-)
+from ibrobot_core.app import RequestError, RobotConfig, echo, find_config, installed_plugins, load_config, wrong_input
 
 
 @attrs.frozen(kw_only=True)
@@ -66,7 +57,7 @@ class MountCamera(Board):
         config = load_config(source, sim=self.sim)
         camera = _camera(config, self.camera)
         if self.write and source.resolve() in {
-            path.resolve() for path in shipped_configs(installed_plugins()).values()
+            path.resolve() for path in installed_plugins().shipped_configs().values()
         }:
             raise RequestError(
                 f"--write: {source} is shipped with ibrobot: `ibrobot config copy` makes a file of your own"

@@ -11,9 +11,9 @@ from pathlib import Path
 import attrs
 from ibrobot_calibration import Calibration, JointCalibration, calibration_path
 from ibrobot_terminal import Guide
+from ibrobot_terminal.questions import Declined
 
 from ibrobot_core.api import HardwareError, IbrobotError, option
-from ibrobot_core.app import Declined
 from ibrobot_feetech.arm import calibrated_registers, relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.calibration import ZERO_AT, save_calibration

@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 import attrs
 from ibrobot_calibration import Calibration, load_calibration
 from ibrobot_terminal import Guide
+from ibrobot_terminal.questions import Declined
 
 from ibrobot_core.api import option
-from ibrobot_core.app import Declined, Unsuccessful
+from ibrobot_core.app import Unsuccessful
 from ibrobot_feetech.arm import calibrated_registers, relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import TerminalGuide

@@ -8,9 +8,10 @@ import attrs
 import numpy as np
 from ibrobot_calibration import load_calibration
 from ibrobot_terminal import Guide
+from ibrobot_terminal.questions import Declined
 
 from ibrobot_core.api import HardwareError, Vector, option
-from ibrobot_core.app import Declined, Unsuccessful
+from ibrobot_core.app import Unsuccessful
 from ibrobot_feetech.arm import find_servos, relax
 from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.commands.joints import Joint, arm_of, joints_of

@@ -10,11 +10,12 @@ from contextlib import ExitStack
 from typing import override
 
 from ibrobot_terminal import Guide, KeyReader
+from ibrobot_terminal.questions import confirm, prompt
 from rich.box import SIMPLE_HEAD
 from rich.live import Live
 from rich.table import Table
 
-from ibrobot_core.app import RequestError, Screen, confirm, echo, prompt
+from ibrobot_core.app import RequestError, Screen, echo
 
 _PERIOD_S = 0.03
 """Time between two updates of a table [s]."""

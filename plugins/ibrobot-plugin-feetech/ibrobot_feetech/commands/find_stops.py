@@ -17,9 +17,9 @@ from enum import Enum
 import attrs
 import numpy as np
 from ibrobot_terminal import Guide
+from ibrobot_terminal.questions import Declined
 
 from ibrobot_core.api import CalibrationError, HardwareError
-from ibrobot_core.app import Declined
 from ibrobot_feetech.arm import hold, relax, write_eprom
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.joints import Joint

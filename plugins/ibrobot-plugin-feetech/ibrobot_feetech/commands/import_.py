@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import attrs
 from ibrobot_calibration import Calibration, calibration_path, load_calibration
+from ibrobot_terminal.questions import Declined
 
 from ibrobot_core.api import CalibrationError, HardwareError, option
-from ibrobot_core.app import Declined, echo
+from ibrobot_core.app import echo
 from ibrobot_feetech.calibration import ZERO_AT, save_calibration
 from ibrobot_feetech.commands.calibrate import backup
 from ibrobot_feetech.commands.dialogue import TerminalGuide

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import attrs
 from ibrobot_calibration import JointCalibration
 from ibrobot_terminal import Guide
+from ibrobot_terminal.questions import Declined
 
 from ibrobot_core.api import CalibrationError
-from ibrobot_core.app import Declined
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.joints import Joint
 from ibrobot_feetech.commands.ranges import Range, doubtful, homing_offset, impossible

@@ -7,9 +7,10 @@ from contextlib import suppress
 
 import attrs
 from ibrobot_terminal import Guide
+from ibrobot_terminal.questions import Declined
 
 from ibrobot_core.api import HardwareError, option
-from ibrobot_core.app import Declined, RequestError
+from ibrobot_core.app import RequestError
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.commands.joints import Joint, by_servo, chosen, joints_of

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import attrs
+from ibrobot_terminal.questions import Declined
 
 from ibrobot_core.api import option
-from ibrobot_core.app import Declined, RequestError, echo
+from ibrobot_core.app import RequestError, echo
 from ibrobot_feetech.arm import hold, relax
 from ibrobot_feetech.commands.dialogue import TerminalGuide
 from ibrobot_feetech.commands.joints import Joint, by_servo, chosen, joints_of

@@ -10,9 +10,10 @@ from typing import Any
 
 import attrs
 from ibrobot_provenance.ownership import InUse
+from ibrobot_terminal.questions import Declined, confirm
 
 from ibrobot_core.api import EpisodeSummary, RecorderError, option
-from ibrobot_core.app import Declined, Emit, Failed, RequestError, Unsuccessful, confirm, echo, wrong_input
+from ibrobot_core.app import Emit, Failed, RequestError, Unsuccessful, echo, wrong_input
 from ibrobot_mcap.changes import OUTCOMES, Changed, InTrash
 
 

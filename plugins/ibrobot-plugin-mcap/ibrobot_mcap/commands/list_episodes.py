@@ -10,7 +10,7 @@ from typing import Any
 import attrs
 from rich.table import Table
 
-from ibrobot_core.api import EpisodeSummary, RecorderError, option
+from ibrobot_core.api import EpisodeAddress, EpisodeSummary, RecorderError, option
 from ibrobot_core.app import Screen, Unsuccessful, echo, styled, wrong_input
 
 _WIDE = 100
@@ -91,14 +91,12 @@ class ListEpisodes:
 
 def _short_name(episode: Path) -> str:
     """The shortest name of an episode that every command takes: `find_episode` gives its path."""
-    from ibrobot_core.app import find_episode
-
     numbered = re.fullmatch(r"episode_(\d{6,})", episode.name)
     if numbered is not None and episode.parent.name == "episodes":
         dataset = episode.parents[1]
         for name in (dataset.name, str(dataset)):
             short = f"{name}:{int(numbered[1])}"
-            if find_episode(Path(short)) == episode:
+            if EpisodeAddress.find(Path(short)) == episode:
                 return short
     return str(episode)
 

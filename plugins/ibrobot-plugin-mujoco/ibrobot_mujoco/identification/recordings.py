@@ -14,6 +14,7 @@ import numpy as np
 from ibrobot_core.api import (
     NS_PER_S,
     Contract,
+    EpisodeAddress,
     EpisodeReader,
     Float64MultiArray,
     JointState,
@@ -21,7 +22,7 @@ from ibrobot_core.api import (
     Robot,
     Vector,
 )
-from ibrobot_core.app import find_episode, installed_plugins
+from ibrobot_core.app import installed_plugins
 
 SHORTEST_S = 2.0
 """A recording that is shorter tells nothing of an arm."""
@@ -72,7 +73,7 @@ def find_recordings(paths: Sequence[Path]) -> list[Path]:
     """
     listed: list[Path] = []
     for path in paths:
-        episode = find_episode(path)
+        episode = EpisodeAddress.find(path)
         if not episode.exists() and ":" not in episode.name:
             raise RecorderError(f"{path}: there is no such recording")
         below = sorted(episode.glob("episodes/episode_*")) or sorted(episode.glob("episode_*"))

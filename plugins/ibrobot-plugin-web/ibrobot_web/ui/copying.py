@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import attrs
+from ibrobot_terminal.questions import prompt
 
 from ibrobot_core.api import option
 from ibrobot_core.app import (
@@ -20,7 +21,6 @@ from ibrobot_core.app import (
     find_config,
     installed_plugins,
     load_config,
-    prompt,
 )
 
 _ODD = re.compile(r"[{}\"'#\s\\]|:$")

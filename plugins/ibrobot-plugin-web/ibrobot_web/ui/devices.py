@@ -10,13 +10,12 @@ import attrs
 from ibrobot_terminal import Question
 from ibrobot_terminal.guide import installed_guides
 
-from ibrobot_core.api import IbrobotError, option
+from ibrobot_core.api import IbrobotError, how_to_install, option
 from ibrobot_core.app import (
     ChannelMessage,
     Child,
     ComponentFailed,
-    install_command,
-    official_plugins,
+    installed_plugins,
 )
 from ibrobot_web.pictures import Picture
 from ibrobot_web.ui.context import Routes, Ui
@@ -129,8 +128,8 @@ def listing(ui: Ui) -> dict[str, Any]:
         }
         for guide in installed_guides()
     ]
-    others = [package for package, offers in official_plugins().items() if "guide" in offers]
-    return {"guides": guides, "install": "" if guides else install_command(others)}
+    others = installed_plugins().official("guide").values()
+    return {"guides": guides, "install": "" if guides else how_to_install(*others)}
 
 
 def start(ui: Ui, name: str, answers: Mapping[str, str | bool] = option(factory=dict)) -> dict[str, int]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin
 
 import attrs
+from ibrobot_provenance.asking import read_event
 from ibrobot_provenance.processes import IBROBOT, arguments
 
 from ibrobot_core.api import IbrobotError
@@ -17,12 +18,10 @@ from ibrobot_core.app import (
     Command,
     Event,
     Failed,
-    decode_event,
     default_of,
     fields,
     flag_of,
     installed_plugins,
-    official_plugins,
     read_options,
 )
 from ibrobot_web.ui.context import Ui
@@ -45,7 +44,7 @@ WITH_ROBOT = frozenset({"record"})
 def job_commands() -> list[str]:
     """The commands that run by a form: those with events, and those that packages not installed here would add."""
     declared = {name for name, each in installed_plugins().commands.items() if each.events and " " not in name}
-    return sorted(declared.union(*(offers.get("job", ()) for offers in official_plugins().values())) - WITH_ROBOT)
+    return sorted(declared.union(installed_plugins().official("job")) - WITH_ROBOT)
 
 
 def title_of(name: str) -> str:
@@ -142,8 +141,7 @@ def run_command(ui: Ui, name: str, **values: Any) -> list[Event]:
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         raise IbrobotError(f"“{title_of(name)}” did not end within {_COMMAND_S:g} s") from None
-    kinds = (*command.events, Failed)
-    events = [event for line in done.stdout.splitlines() if (event := decode_event(line, kinds)) is not None]
+    events = [event for line in done.stdout.splitlines() if (event := read_event(line, command.events)) is not None]
     if errors := [event.error for event in events if isinstance(event, Failed)]:
         raise IbrobotError(in_page_words("; ".join(errors), command).replace(f"{ui.folders.first}/", ""))
     if done.returncode:

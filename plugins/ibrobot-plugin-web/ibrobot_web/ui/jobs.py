@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import attrs
-from ibrobot_provenance.asking import Answer, Ask
+from ibrobot_provenance.asking import Answer, Ask, read_event
 from ibrobot_provenance.processes import Reader, arguments
 
 from ibrobot_core.api import IbrobotError, option
-from ibrobot_core.app import Command, Failed, WireError, decode_event, installed_plugins
+from ibrobot_core.app import Command, Failed, WireError, installed_plugins
 from ibrobot_web.pictures import Picture
 from ibrobot_web.ui.context import Routes, Ui
 from ibrobot_web.ui.folders import Folders
@@ -63,7 +63,7 @@ def event_reader(folders: Folders, command: Command) -> Reader:
 
     def read(line: str) -> Mapping[str, Any] | None:
         try:
-            event = decode_event(line, (*command.events, Failed))
+            event = read_event(line, command.events)
         except WireError as error:
             return {"error": f"the page does not understand an event of this job: {error}"}
         if event is None:

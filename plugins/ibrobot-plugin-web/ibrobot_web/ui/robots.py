@@ -12,15 +12,7 @@ from typing import Any
 from ibrobot_terminal.guide import installed_guides
 
 from ibrobot_core.api import IbrobotError, option
-from ibrobot_core.app import (
-    ConfigError,
-    RobotConfig,
-    find_config,
-    installed_plugins,
-    load_config,
-    notes_of,
-    shipped_configs,
-)
+from ibrobot_core.app import ConfigError, RobotConfig, find_config, installed_plugins, load_config, notes_of
 from ibrobot_web.modes import modes_json
 from ibrobot_web.ui.context import Routes, Ui
 from ibrobot_web.ui.copying import variables_of, write_copy
@@ -45,7 +37,7 @@ def listing(ui: Ui) -> list[dict[str, str]]:
     """The robots to choose from: `robot`, its summary, and where it is from."""
     robots = []
     plugins = {config.name: config.summary for config in installed_plugins().configs}
-    for name, path in shipped_configs(installed_plugins()).items():
+    for name, path in installed_plugins().shipped_configs().items():
         source = "plugin" if name in plugins else "ibrobot"
         robots.append({"robot": name, "source": source, "summary": plugins.get(name) or _summary(_head(path))})
     for path in _yamls(ui):
@@ -55,7 +47,7 @@ def listing(ui: Ui) -> list[dict[str, str]]:
 
 def robot_names(ui: Ui) -> list[str]:
     """The robots to choose from, as requests name them: one's own first."""
-    return [*(ui.folders.name(path) for path in _yamls(ui)), *shipped_configs(installed_plugins())]
+    return [*(ui.folders.name(path) for path in _yamls(ui)), *installed_plugins().shipped_configs()]
 
 
 def _yamls(ui: Ui) -> Iterator[Path]:
@@ -201,7 +193,7 @@ def robot_of(ui: Ui, name: str) -> str:
     Raises:
         IbrobotError: if it is outside the opened folders.
     """
-    return name if name in shipped_configs(installed_plugins()) else str(ui.folders.find(name))
+    return name if name in installed_plugins().shipped_configs() else str(ui.folders.find(name))
 
 
 def run_arguments(ui: Ui, robot: str, sim: bool, mode: str) -> list[str]:
