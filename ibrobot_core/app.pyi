@@ -52,20 +52,18 @@ from ibrobot_core.interfaces.run import (
     GoalRun as GoalRun,
     GuardedRun as GuardedRun,
     RecordedRun as RecordedRun,
-    Plugins as Plugins,
 )
 from ibrobot_core.launch.runtime import Runtime as Runtime
 from ibrobot_core.component import Component as Component, SessionWorker as SessionWorker, CONTROL as CONTROL
 from ibrobot_core.bug_reports import error_text as error_text
 from ibrobot_core.interfaces.run_state import ControlState as ControlState
-from ibrobot_core.run_hooks import RunHooks as RunHooks, RUN_KEYS as RUN_KEYS, check_key as check_key
+from ibrobot_core.run_hooks import RunHooks as RunHooks
 from ibrobot_core.launch.episodes import Episodes as Episodes
 from ibrobot_core.launch.models import check_models as check_models
 from ibrobot_core.launch.absence import notes_of as notes_of
 
 # Sources
 from ibrobot_core.component import SourceWorker as SourceWorker
-from ibrobot_core.launch.sources.policy import PolicySource as PolicySource
 from ibrobot_core.launch.sources.operator_devices import OperatorDevices as OperatorDevices
 from ibrobot_core.control.spline import Spline as Spline
 
@@ -80,7 +78,7 @@ from ibrobot_core.services import (
     NoRequest as NoRequest,
     RequestLimits as RequestLimits,
 )
-from ibrobot_core.launch.authority import Agent as Agent, Authority as Authority, Grant as Grant
+from ibrobot_core.launch.authority import Agent as Agent, Authority as Authority
 
 # Episodes and datasets
 from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler, FrameSampler as FrameSampler

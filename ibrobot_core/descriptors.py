@@ -123,12 +123,12 @@ class Options:
         return ()
 
     def terminal_keys(self, robot: Robot) -> Mapping[str, str]:
-        """Of teleop: maps the keys that the device reads from the terminal to what they do, e.g. `space` to `deadman`.
+        """Maps the keys that the component reads from the terminal to what they do, e.g. `space` to `deadman`.
 
         A device with keys needs a terminal. Devices of one mode share a key only if it does the same for all of them.
 
         Args:
-            robot: what the device moves.
+            robot: what a device moves, or the whole robot.
         """
         return {}
 

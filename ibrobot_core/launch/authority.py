@@ -14,7 +14,7 @@ from contextlib import suppress
 from contextvars import ContextVar
 from functools import partial
 from json import dumps
-from typing import Any
+from typing import Any, ClassVar
 
 import attrs
 import numpy as np
@@ -116,6 +116,9 @@ class Authority:
     Args:
         session: the run, a `launch.session.Session`.
     """
+
+    usual: ClassVar[tuple[str, ...]] = MOVING
+    """What a person grants by default, of what a run serves."""
 
     def __init__(self, session: Any) -> None:
         self._session = session

@@ -93,9 +93,10 @@ def test_a_key_with_two_meanings_is_refused(device: str, keys: str, twice: str) 
          "where it also begins a highlight; give one of them another key"),
         ("{keep: highlights, highlight_key: enter}", "highlight_key: 'enter' is the takeover_key, too; give one of "
          "them another key"),
-        ("{takeover_key: tab}", "takeover_key: 'tab' is start and end of an episode in every run; give another key"),
-        ("{keep: highlights, highlight_key: f11}", "highlight_key: 'f11' is end of an episode in every run; give "
-         "another key"),
+        ("{takeover_key: tab}", "takeover_key: key 'tab' is both takeover and, in every run, start and "
+         "end of an episode"),
+        ("{keep: highlights, highlight_key: f11}", "highlight_key: key 'f11' is both begin and end of a highlight "
+         "and, in every run, end of an episode"),
         ("{highlight_key: o}", ""),
     ],
 )  # fmt: skip

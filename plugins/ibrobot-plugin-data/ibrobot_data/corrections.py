@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Mapping
-from typing import override
+from typing import Any, Protocol, override
 
 import attrs
 from ibrobot_terminal import HeldKeys
@@ -14,6 +14,7 @@ from ibrobot_core.api import (
     String,
     TeleopCommand,
     TeleopError,
+    Vector,
     documented,
     option,
     seconds,
@@ -23,7 +24,6 @@ from ibrobot_core.app import (
     ControlMode,
     ControlState,
     OperatorDevices,
-    PolicySource,
     Service,
     SourceWorker,
     StreamingRun,
@@ -49,6 +49,33 @@ _ANSWER_S = 60.0
 """Longest hold while the policy does not answer; later its setpoints count as stale [s]."""
 
 
+class Interruptible(Protocol):
+    """The source that runs the policy."""
+
+    name: str
+
+    def begin(self, seed: int) -> None:
+        """Start."""
+
+    def end(self) -> None:
+        """Stop."""
+
+    def recover(self) -> None:
+        """Recover from a failure."""
+
+    def facts(self) -> Mapping[str, Any]:
+        """Facts for the summary of the run."""
+
+    def described(self) -> Mapping[str, str]:
+        """Name and weights of the policy."""
+
+    def suspend(self) -> None:
+        """Send no plan until `resume`."""
+
+    def resume(self, position: Vector) -> None:
+        """Ask the policy for a plan that begins at a position [rad], shape (A,)."""
+
+
 class Corrections(SourceWorker):
     """Lets an operator take the robot from a policy and give it back, any number of times.
 
@@ -70,7 +97,7 @@ class Corrections(SourceWorker):
     sends_stops = True
     urgent = True
 
-    def __init__(self, session: StreamingRun, mode: ControlMode, policy: PolicySource) -> None:
+    def __init__(self, session: StreamingRun, mode: ControlMode, policy: Interruptible) -> None:
         assert mode.inference is not None
         config = session.config
         self._devices = OperatorDevices(session, mode.inference.devices)

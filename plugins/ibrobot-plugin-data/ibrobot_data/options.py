@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, override
 
 import attrs
 
 from ibrobot_core.api import OptionFault, Options, documented, option
-from ibrobot_core.app import RUN_KEYS, check_key
 
 if TYPE_CHECKING:
+    from ibrobot_core.api import Robot
     from ibrobot_core.app import RobotConfig, RunView
 
 COMMANDER = "/commander"
@@ -24,10 +24,6 @@ PLANNER = "planner"
 """Who commands in the episodes of a mode with a planner."""
 
 
-def _check_key(_: object, __: object, key: str) -> None:
-    check_key(key)
-
-
 @documented
 @attrs.frozen
 class EpisodesOptions(Options):
@@ -39,9 +35,7 @@ class EpisodesOptions(Options):
         help="what takes the robot from a policy: the key or the device's button; deadman: also pressing the device's "
         "deadman, or moving a leader arm without one. Releasing it gives the robot back",
     )
-    takeover_key: str = option(
-        "enter", validator=_check_key, help="key that takes the robot from a policy, and gives it back"
-    )
+    takeover_key: str = option("enter", help="key that takes the robot from a policy, and gives it back")
     keep: str = option(
         "all",
         choices=("all", "corrections", "highlights"),
@@ -50,7 +44,12 @@ class EpisodesOptions(Options):
     )
     before: float = option(5.0, unit="s", ge=0, le=600, help="time to keep before a correction or a highlight")
     after: float = option(1.0, unit="s", ge=0, le=600, help="time to keep after a correction")
-    highlight_key: str = option("insert", validator=_check_key, help="key that begins and ends a highlight")
+    highlight_key: str = option("insert", help="key that begins and ends a highlight")
+
+    @override
+    def terminal_keys(self, robot: Robot) -> Mapping[str, str]:
+        highlights = {self.highlight_key: "begin and end of a highlight"} if self.keep == "highlights" else {}
+        return {self.takeover_key: "takeover", **highlights}
 
 
 def options_of(config: RobotConfig) -> EpisodesOptions:
@@ -79,9 +78,6 @@ def check_keys(config: RobotConfig) -> Iterator[OptionFault]:
         if modes and options.highlight_key == options.takeover_key:
             message = f"{options.highlight_key!r} is the takeover_key, too; give one of them another key"
             yield OptionFault(("episodes", "highlight_key"), message)
-    for option_, (key, _) in keys.items():
-        if key in RUN_KEYS:
-            yield OptionFault(("episodes", option_), f"{key!r} is {RUN_KEYS[key]} in every run; give another key")
     for mode in modes:
         assert mode.inference is not None
         for group, name in mode.inference.devices.items():

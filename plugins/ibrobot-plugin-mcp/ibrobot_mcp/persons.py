@@ -12,12 +12,11 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import attrs
 from ibrobot_ros2.services import plain
 from ibrobot_terminal.agent_calls import AgentCalls, planned_path
 
 from ibrobot_core.api import IbrobotError, did_you_mean
-from ibrobot_core.app import Grant, RequestError, RunView, error_text
+from ibrobot_core.app import Authority, RequestError, RunView, error_text
 from ibrobot_mcp.tokens import own_folder
 
 SERVICES = ("/agent/arm", "/agent/disarm", "/agent/status")
@@ -27,7 +26,7 @@ _LARGEST = 64 * 1024
 _TIMEOUT_S = 10.0
 _AT_ONCE, _WAITING = 8, 16
 """Most callers that are answered at the same time, and most others that wait for them."""
-MOVING: tuple[str, ...] = attrs.fields(Grant).services.default or ()
+MOVING = Authority.usual
 """What is granted by default, of what a run serves."""
 
 

@@ -14,7 +14,7 @@ from ibrobot_testing import make_session, stand_in
 from mcp import Client
 
 from ibrobot_core.api import option
-from ibrobot_core.app import Grant, NoRequest, Service, Session
+from ibrobot_core.app import NoRequest, Service, Session
 
 
 @attrs.frozen
@@ -81,7 +81,7 @@ class Rig:
         return len(self.moves)
 
     def grant(self, **more: Any) -> None:
-        self.session.bus.call("/agent/arm", Grant(**{"seconds": 60.0, "services": ("/test/move",), **more}))
+        self.session.bus.call("/agent/arm", {"seconds": 60.0, "services": ["/test/move"], **more})
 
     def talk(self, act: Callable[[Client], Awaitable[Any]], mode: str = "auto") -> Any:
         """Connect an agent, and have it act."""

@@ -43,13 +43,13 @@ def loaded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[RobotConf
 @pytest.fixture
 def check(loaded: tuple[RobotConfig, Registry]) -> Check:
     """Checks the text of a task for the arm, in mode `plan` unless another is given."""
-    config, registry = loaded
+    config, _ = loaded
     world = first_world(config.plugin_sections["world"].options, scene_objects(config))
 
     def checked(text: str, mode: str = "plan", parameters: tuple[str, ...] = (), **changes: Any) -> CheckedTask:
         given = {"world": world, "movable": ("cube", "ball"), **changes}
         robot = attrs.evolve(config, default_control_mode=mode)
-        return check_task(read_task(text, "task.yaml", parameters), Situation(robot, registry, **given))
+        return check_task(read_task(text, "task.yaml", parameters), Situation(robot, **given))
 
     return checked
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from typing import Any
 
-import attrs
-
-from ibrobot_core.app import Authority, Grant, RunView
+from ibrobot_core.app import Authority, RunView
 from ibrobot_terminal.agent_calls import AgentCall, AgentCalls, AskedPath, planned_path
 
 ALLOW, REFUSE, TIME, SPEED = "Y", "N", "T", "V"
@@ -100,10 +99,10 @@ class AgentKeys:
                 return self._too_soon
         return acts.get(key)
 
-    def _grant(self, asked: AgentCall) -> Grant:
-        usual: Sequence[str] = attrs.fields(Grant).services.default or ()
-        services = tuple(dict.fromkeys([*usual, asked.service]))
-        return Grant(self._seconds[0], services, self._speed[0], agent=asked.agent, by="panel")
+    def _grant(self, asked: AgentCall) -> dict[str, Any]:
+        services = list(dict.fromkeys([*self._authority.usual, asked.service]))
+        scope = {"seconds": self._seconds[0], "services": services, "speed": self._speed[0]}
+        return {**scope, "agent": asked.agent, "by": "panel"}
 
     def _is_read(self, asked: AgentCall) -> bool:
         """Whether a person has had the time to read the request, which is then answered; a key that repeats has not."""

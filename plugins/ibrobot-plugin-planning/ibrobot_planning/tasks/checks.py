@@ -10,7 +10,7 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import IbrobotError, PlanningError, Vector
-from ibrobot_core.app import ControlMode, Plugins, RobotConfig, check_models
+from ibrobot_core.app import ControlMode, RobotConfig, check_models, installed_plugins
 from ibrobot_planning.execution.plans import tool_planners
 from ibrobot_planning.goals.grammar import GoalOptions
 from ibrobot_planning.goals.joints import named_pose, pose_names
@@ -38,7 +38,6 @@ class Situation:
     """The robot and the situation for which a task is checked."""
 
     config: RobotConfig
-    registry: Plugins
     world: World | None
     """The objects; None for a robot without a section `world`."""
     movable: Collection[str] = ()
@@ -78,7 +77,7 @@ def check_task(file: TaskFile, situation: Situation) -> CheckedTask:
 class _Checks:
     def __init__(self, file: TaskFile, situation: Situation) -> None:
         self._file, self._document, self._situation = file, file.document, situation
-        self._tool_planners = tool_planners(situation.registry)
+        self._tool_planners = tool_planners()
         self._moved = set(situation.elsewhere)
         """Objects that have left the poses that the world has for them."""
         self._held = situation.held
@@ -327,7 +326,7 @@ class _Checks:
             self._available(key, step.mode)
         else:
             try:
-                check_models(config, self._situation.registry, [step.mode], step.prompt)
+                check_models(config, installed_plugins(), [step.mode], step.prompt)
             except IbrobotError as error:
                 self._document.add(key, str(error))
 

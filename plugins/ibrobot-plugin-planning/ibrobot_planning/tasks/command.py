@@ -95,7 +95,7 @@ def _checked(file: TaskFile, robot: RobotConfig, registry: Registry) -> CheckedT
     # The seed of the run places these.
     movable = [thing.name for thing in scene if thing.topic]
     why = "" if robot.recording is not None else "the robot YAML has no section `recording`"
-    return check_task(file, Situation(robot, registry, world, movable, None, why, elsewhere=movable))
+    return check_task(file, Situation(robot, world, movable, None, why, elsewhere=movable))
 
 
 class TaskHooks(RunHooks):

@@ -104,12 +104,11 @@ def _problem(ui: Ui, problem: Any) -> dict[str, Any]:
 
 def _facts(config: RobotConfig) -> dict[str, Any]:
     """What a page shows of a robot YAML without problems."""
-    registry = installed_plugins()
     hardware = {} if config.simulated else config.hardware
     devices = {
         f"{name}: {what}": device for name, each in hardware.items() for what, device in each.options.devices().items()
     }
-    modes = modes_json(config, registry, terminal=False)
+    modes = modes_json(config, terminal=False)
     recording = config.recording
     return {
         "name": config.robot.name, "simulated": config.simulated, "joints": list(config.robot.joint_names),
