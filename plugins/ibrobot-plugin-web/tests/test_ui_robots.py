@@ -13,7 +13,7 @@ from ibrobot_terminal import GuideDescriptor, Question
 from ibrobot_web.ui import robots
 from ui_server import UiServer, run_ui
 
-from ibrobot_core.app import installed_plugins, shipped_configs
+from ibrobot_core.app import installed_plugins
 
 ROBOT = """# A pan axis: it turns a camera.
 robot:
@@ -61,7 +61,7 @@ def test_robots_of_a_clone_are_listed_once_and_without_those_of_its_sources(tmp_
         (tmp_path / place / "pan.yaml").write_text(ROBOT)
     for package in (tmp_path, packages):
         (package / "pyproject.toml").touch()
-    configs = shipped_configs(installed_plugins())["so101"].parent
+    configs = installed_plugins().shipped_configs()["so101"].parent
 
     async def test(server: UiServer) -> None:
         listed = await server.get("robots/list")

@@ -251,7 +251,7 @@ class TeleopSuite(Suite[Teleop]):
         """`read` raises TeleopError before `connect`, and after `disconnect`."""
         ctx = self.context()
         with pytest.raises(TeleopError):
-            operate(self.make(ctx), self._measure(ctx, self.poses(ctx)[0]))
+            self.make(ctx).operate(self._measure(ctx, self.poses(ctx)[0]))
         with self.connected() as (teleop, ctx):
             pass
         with pytest.raises(TeleopError):

@@ -52,7 +52,7 @@ def robot_names(ui: Ui) -> list[str]:
 
 def _yamls(ui: Ui) -> Iterator[Path]:
     """The robot YAMLs of the opened folders: not those that come with ibrobot, nor those within source packages."""
-    shipped = {path.resolve() for path in shipped_configs(installed_plugins()).values()}
+    shipped = {path.resolve() for path in installed_plugins().shipped_configs().values()}
     yamls = (path for path in _files(ui) if path.suffix in (".yaml", ".yml") and ui.folders.has(path))
     own = (path for path in yamls if path.resolve() not in shipped and _ROBOT.search(_head(path)))
     return itertools.islice(own, _MOST)
