@@ -138,14 +138,14 @@ class AgentKeys:
 
     def _request(self, asked: AgentCall) -> list[tuple[str, str]]:
         grant = self._grant(asked)
-        scope = f"{grant.seconds:g} s, {grant.speed:.0%} of the speed limits, {', '.join(grant.services)}"
+        scope = f"{grant['seconds']:g} s, {grant['speed']:.0%} of the speed limits, {', '.join(grant['services'])}"
         keys = f"{ALLOW} lets it move   {REFUSE} refuses   {TIME} time   {SPEED} speed"
         if self._taken:
             keys = f"{', '.join(self._taken)} moves the robot in this YAML: use `ibrobot agent arm`"
         request = " ".join(asked.request.split())
         return [
             ("agent", f"{asked.agent} asks for {asked.service}"),
-            ("path", self._path_of(asked, grant.speed)),
+            ("path", self._path_of(asked, grant["speed"])),
             ("grant", scope),
             ("keys", keys),
             ("request", request if len(request) <= _LONGEST else f"{request[:_LONGEST]} …"),
