@@ -26,6 +26,7 @@ def entries(table: Path) -> list[tuple[str, str]]:
 def test_a_table_fits_the_code(table: Path) -> None:
     sources = [*STATIC.rglob("*.js"), *STATIC.glob("*.html"), *STATIC.parent.rglob("*.py")]
     sources += (STATIC.parents[3]).glob("plugins/ibrobot-plugin-*/ibrobot_*/**/*.py")
+    sources += STATIC.parents[3].glob("configs/*.yaml")
     code = "\n".join(path.read_text(encoding="utf-8") for path in sources if path.parent.name != "words").casefold()
     known = entries(table)
     assert len(known) > 300

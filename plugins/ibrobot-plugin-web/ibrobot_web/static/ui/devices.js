@@ -19,7 +19,7 @@ export class View {
     this.steps = h("ol", { class: "list steps", "aria-live": "polite" });
     this.ask = h("div", { class: "ask" });
     this.cancel = h("button", { onclick: () => this.post("cancel") }, "Cancel");
-    this.work = h("section", { class: "card", "aria-label": "Steps", hidden: true },
+    this.work = h("section", { class: "card", "aria-label": "Steps of the guide", hidden: true },
       h("div", { class: "row" }, this.title, this.state), this.steps, this.ask, h("div", { class: "row" }, this.cancel));
     element.append(h("h2", {}, "Devices"), this.work, this.list);
   }
