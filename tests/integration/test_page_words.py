@@ -1,4 +1,4 @@
-"""The Chinese words of what others declare: every label and help of installed commands, and shipped robots, have some."""
+"""Chinese words of what others declare: every label and help of installed commands, and each shipped robot, has some."""
 
 from __future__ import annotations
 
