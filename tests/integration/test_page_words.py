@@ -1,4 +1,4 @@
-"""Chinese words of what others declare: every label and help of installed commands, and each shipped robot, has some."""
+"""Chinese words of what others declare: each label and help of installed commands, and each shipped robot."""
 
 from __future__ import annotations
 

@@ -67,6 +67,7 @@ export class View {
     this.detail.hidden = !path;
     for (const each of this.list.querySelectorAll("tr")) each.classList.toggle("current", each.querySelector("a")?.textContent === path);
     if (!path) return;
+    if (this.head.textContent !== path) refresh(this.body, "opens", () => [h("p", { class: "note" }, "Opening …")]);
     say(this.head, path);
     let sections;
     try {

@@ -206,7 +206,7 @@ export default {
   "Preflight": "运行前检查",
   "Find the parameters of a simulated arm from recordings.": "由录制数据辨识仿真机械臂的参数。",
   "Identify": "参数辨识",
-  "Identifications": "参数辨识",
+  "Identifications": "辨识结果",
   "Recordings": "录制",
   "Recordings of the arm, or folders of them; together some five minutes": "机械臂的录制，或其所在文件夹；总共约五分钟",
   "Robot YAML of the arm; by default the recorded one": "机械臂的机器人 YAML；默认为录制中的 YAML",
