@@ -217,6 +217,19 @@ class TestExchangedMotors:
         astray = np.abs(servos.measured - servos.safety.current).max() > 0.15
         assert not astray or "their motors are exchanged" in fault
 
+    @pytest.mark.parametrize("late", [16, 20, 24])
+    @pytest.mark.parametrize("way", [0.8, 1.0, 1.2])
+    def test_joints_that_are_late_alike_are_none(self, late, way):
+        """Three move behind one another, so that each is where the next one is commanded."""
+        start = np.array([0.0, -0.6, -1.2, 0.0, 0.0, 0.0])
+        servos = Servos(start, np.arange(6))
+        target = start + [way, way, way, 0.0, 0.0, 0.0]
+        commands = [start.copy()] * (late + 1)
+        for _ in range(150):
+            commands.append(servos.safety.apply(target, servos.measured).copy())
+            servos.measured = commands[-1 - late]
+            assert servos.following.check(commands[-1], servos.safety.velocity, servos.measured) == ""
+
     def test_both_joints_are_named(self):
         order = np.array([0, 3, 2, 1, 4, 5])
         target = STILL.copy()
