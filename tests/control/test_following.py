@@ -223,7 +223,7 @@ class TestExchangedMotors:
         """Three move behind one another, so that each is where the next one is commanded."""
         start = np.array([0.0, -0.6, -1.2, 0.0, 0.0, 0.0])
         servos = Servos(start, np.arange(6))
-        target = start + [way, way, way, 0.0, 0.0, 0.0]
+        target = start + np.array([way, way, way, 0.0, 0.0, 0.0])
         commands = [start.copy()] * (late + 1)
         for _ in range(150):
             commands.append(servos.safety.apply(target, servos.measured).copy())
