@@ -45,6 +45,14 @@ def pytest_collection_modifyitems(items):
             item.cls.wait_s = 5.0
 """
 """What is right answers within a fraction of that, and every mutant that never answers takes as long."""
+_ELSEWHERE = """
+import pytest
+
+@pytest.fixture(autouse=True)
+def mutmut_is_configured(tmp_path):
+    (tmp_path / "pyproject.toml").write_text('[tool.mutmut]\\nsource_paths = ["."]')
+"""
+"""Mutmut reads its configuration in every process, and those of a pool run in the folder of the test."""
 
 
 def prepare(folder: Path, kind: str) -> Path:
@@ -59,7 +67,7 @@ def prepare(folder: Path, kind: str) -> Path:
     settings = package / "pyproject.toml"
     text = settings.read_text(encoding="utf-8") + _CONFIG.format(module=module.name, kind=kind)
     settings.write_text(text, encoding="utf-8")
-    (package / "conftest.py").write_text(_IMPATIENT, encoding="utf-8")
+    (package / "conftest.py").write_text(_IMPATIENT + (_ELSEWHERE if kind == "pool" else ""), encoding="utf-8")
     if kind == "message":  # its tests encode one, for which the package has to be installed
         installed = package / f"{module.name}-0.1.0.dist-info"
         installed.mkdir()

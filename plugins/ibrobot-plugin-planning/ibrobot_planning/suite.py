@@ -74,6 +74,7 @@ class PlannerSuite(Suite[Planner]):
             for joints in (ctx.robot.joint_names, ctx.robot.joint_names[::-1], ctx.robot.joint_names[1:3]):
                 request = self.request(ctx, 1, joints)
                 trajectory = planner.plan(request).trajectory
+                assert isinstance(trajectory.header, Header), f"the trajectory's header is {trajectory.header!r}"
                 assert trajectory.joint_names == joints
                 for point in trajectory.points:
                     assert point.positions.shape == (len(joints),)

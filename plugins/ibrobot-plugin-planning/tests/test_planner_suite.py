@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import override
+from typing import Any, override
 
 import attrs
 import numpy as np
@@ -126,9 +126,17 @@ class BlocksItself(FakePlanner):
         return "the arm is in its own way"
 
 
+class NoHeader(FakePlanner):
+    def plan(self, request):
+        nothing: Any = None
+        result = super().plan(request)
+        return attrs.evolve(result, trajectory=attrs.evolve(result.trajectory, header=nothing))
+
+
 WRONG = {
     StopsShort: "goes_from_start_to_goal",
     BeginsLate: "goes_from_start_to_goal",
+    NoHeader: "names_the_joints_asked_for",
     RobotOrder: "names_the_joints_asked_for",
     RunsThroughTheGoal: "begins_and_ends_at_rest",
     TwiceAsFast: "keeps_the_limits",

@@ -41,12 +41,14 @@ class FakeGuide(Guide):
 
     Attributes:
         said: texts, titles of pictures and requests, in their order.
-        tables: the rows of the tables that were shown.
+        columns: the columns of the tables that were shown.
+        tables: their rows.
         sights: the pictures that were shown while the operator worked.
     """
 
     def __init__(self) -> None:
         self.said: list[str] = []
+        self.columns: list[tuple[str, ...]] = []
         self.tables: list[Cells] = []
         self.sights: list[bytes] = []
 
@@ -56,6 +58,7 @@ class FakeGuide(Guide):
 
     @override
     def show(self, columns: Sequence[str], rows: Cells) -> None:
+        self.columns.append(tuple(columns))
         self.tables.append(rows)
 
     @override

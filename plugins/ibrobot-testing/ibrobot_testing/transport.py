@@ -334,7 +334,7 @@ class TransportSuite(Suite[Transport]):
             self.settle(near, far)
             pool.submit(near.request, "echo", b"first", self.wait_s)
             assert begun.get(timeout=self.wait_s) == b"first"
-            second = pool.submit(near.request, "echo", b"second", _HELD_S)
+            second = pool.submit(near.request, "echo", b"second", 2 * self.wait_s)
             wait([second], self.short_s)
             wait([pool.submit(end)], self.short_s)
             release.set()
@@ -357,7 +357,7 @@ class TransportSuite(Suite[Transport]):
             told: queue.SimpleQueue[bool] = queue.SimpleQueue()
             near.watch("echo", told.put)
             assert told.get_nowait() is True
-            asked = pool.submit(near.request, "echo", b"x", _HELD_S)
+            asked = pool.submit(near.request, "echo", b"x", 2 * self.wait_s)
             assert begun.wait(self.wait_s)
             self.kill(far, "echo")
             with pytest.raises(TransportError):
