@@ -174,6 +174,12 @@ CLAIMS = (
         "`lerobot[feetech]`, for its rows",
     ),
     Claim(
+        "can_arm",
+        "a read of eight CAN motors takes at most 1.5x the same frames by python-can alone",
+        "docs/decisions/0070-what-drivers-of-arms-share.md",
+        "can_arm.py",
+    ),
+    Claim(
         "inference_transport",
         "from request to chunk, each way to a model is at least five times as fast as LeRobot's",
         "docs/decisions/0051-robots-choose-their-server.md",

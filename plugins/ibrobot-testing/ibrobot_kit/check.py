@@ -7,8 +7,8 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
-from importlib.metadata import Distribution, PackageNotFoundError, distribution, version
+from collections.abc import Iterator, Sequence
+from importlib.metadata import Distribution, PackageNotFoundError, distribution, entry_points, version
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -81,7 +81,7 @@ def examine(package: str, registry: Registry) -> Iterator[Check]:
         yield Check("discovery", True, offered or "commands, events or other things without a type")
     yield from _versions(installed)
     for point in points:
-        yield _weight(point.module)
+        yield _weight(point.module, _required(installed))
     for entry in entries:
         yield from _described(f"{entry.kind} {entry.descriptor.type}", entry.descriptor)
     modules = {point.module.partition(".")[0] for point in points}
@@ -106,9 +106,17 @@ def _versions(package: Distribution) -> Iterator[Check]:
         yield Check("versions", False, f"{asked} permits all later versions", remedy, matters=False)
 
 
-def _weight(module: str) -> Check:
-    """What discovery imports."""
-    code = f"import json, sys, {module}; print(json.dumps([name for name in {HEAVY!r} if name in sys.modules]))"
+def _required(package: Distribution) -> list[str]:
+    """The modules of the plugins that it requires, which discovery imports all the same."""
+    names = {Requirement(each).name for each in package.requires or () if "extra ==" not in each}
+    return sorted(point.module for point in entry_points(group="ibrobot") if point.dist and point.dist.name in names)
+
+
+def _weight(module: str, required: Sequence[str]) -> Check:
+    """What discovery imports because of it."""
+    before = "".join(f"import {each}\n" for each in required)
+    listed = f"[name for name in {HEAVY!r} if name in sys.modules and name not in before]"
+    code = f"import json, sys\n{before}before = set(sys.modules)\nimport {module}\nprint(json.dumps({listed}))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
     if done.returncode:
         lines = done.stderr.strip().splitlines() or ["it ended without a word"]

@@ -81,7 +81,7 @@ class NewPlugin:
         for file, text in lists.items():
             file.write_text(text, encoding="utf-8")
         listed = [str(file.relative_to(repository.root)) for file in lists] if repository is not None else []
-        robot = next(text for path, text in files.items() if "/" not in path and path.endswith(".yaml"))
+        robot = next(text for path, text in files.items() if path.endswith(f"{self.name}.yaml"))
         command = robot.partition("\n")[0].partition(": ")[2]  # at the top of the file
         return {"folder": str(folder), "files": sorted(files), "entered": listed, "command": command}
 

@@ -100,6 +100,15 @@ def test_mistake_fails_with_its_cause(site: Site, old: str, new: str, name: str,
     assert message in f"{wrong[0].found}; {wrong[0].remedy}"
 
 
+@pytest.mark.parametrize(("requires", "is_light"), [(REQUIRES, False), (f"{REQUIRES}\nRequires-Dist: fake-base", True)])
+def test_what_a_required_plugin_imports_is_not_its_own_weight(site: Site, requires: str, *, is_light: bool) -> None:
+    source = site.sources / "base.py"
+    source.write_text("import numpy\n")
+    site.add("fake-base", source)
+    install(site, f"import fake_base\n{PLUGIN}", requires)
+    assert checks()["weight"].ok is is_light
+
+
 def test_missing_dependency_of_an_implementation_is_named(site: Site) -> None:
     install(site, PLUGIN.replace("ibrobot_testing.fakes.host:", "fake_stick:"))
     (site.folder / "fake_stick.py").write_text("import no_such_library.sticks\n")
