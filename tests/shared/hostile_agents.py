@@ -122,6 +122,8 @@ class HostileRun:
         self.stop_ticks: list[int] = []
         self.orders_obeyed = 0
         self.before: np.ndarray | None = None
+        self.outside, self.generation = np.zeros(len(self.robot.joints)), -1
+        """How far each joint is beyond its limits [rad], and the generation of the last state."""
         self.granted_for = self.held_for = 0
         """Ticks since a grant, and since nothing is granted."""
         self.moved = 0.0
@@ -156,8 +158,12 @@ class HostileRun:
     def _judge(self, state: Any) -> None:
         """Count what the commands of a tick break."""
         command = state.command
-        within = np.isfinite(command).all() and (command >= self.robot.lower - 1e-9).all()
-        self.broken["limits of joints"] += not (within and (command <= self.robot.upper + 1e-9).all())
+        # A reset begins where the joints are: at a limit, their load may hold them beyond it, and from there they move
+        # no further out (docs/explanation/safety.md).
+        outside = np.maximum(0.0, np.maximum(self.robot.lower - command, command - self.robot.upper))
+        allowed = self.outside if state.generation == self.generation else np.maximum(self.outside, _STILL_RAD)
+        self.broken["limits of joints"] += not (np.isfinite(command).all() and (outside <= allowed + 1e-9).all())
+        self.outside, self.generation = outside, state.generation
         if self.before is not None:
             moved = np.abs(command - self.before)
             speeds = moved * 100.0 / self.robot.max_velocity
