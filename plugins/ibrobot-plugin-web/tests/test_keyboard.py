@@ -81,8 +81,8 @@ def test_focus_stays_and_cards_say_what_happened(tmp_path: Path) -> None:
         }
         for after, before in replaced.items():
             assert page.evaluate(REPLACED, [list(before), list(after)]) == before[-1]
-        for after in ([], ["Discard"], ["Begin again"]):
-            shown = page.evaluate(REPLACED, [["Redo", "Begin"], after])
+        for others in ([], ["Discard"], ["Begin again"]):
+            shown = page.evaluate(REPLACED, [["Redo", "Begin"], others])
             assert shown == "the place", "a key that is pressed twice presses nothing else"
 
         assert "by signal 9" in page.evaluate(FAILED, [-9, ["mode web | loop 100 Hz"]])
