@@ -43,7 +43,8 @@ def _misplaced(interface: type) -> list[str]:
     """The methods of an interface that its row does not list where they belong."""
     own = [key for key, value in vars(interface).items() if inspect.isfunction(value) and not key.startswith("_")]
     abstract = getattr(interface, "__abstractmethods__", ())
-    must, might = (re.findall(r"`(\w+)`", cell) for cell in _row(interface.__name__)[1:3])
+    must, might, done = (re.findall(r"`(\w+)`", cell) for cell in _row(interface.__name__)[1:4])
+    own = [key for key in own if key not in {*done} - {*must, *might}]
     return [
         *set(must) ^ {key for key in own if key in abstract},
         *set(might) ^ {key for key in own if key not in abstract},

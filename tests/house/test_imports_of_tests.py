@@ -25,6 +25,7 @@ ALLOWED = {
     ("ibrobot-plugin-diagnose/tests/test_causes.py", "ibrobot_core.plugins"): "plugins that are not installed",
     ("ibrobot-plugin-mujoco/tests/pick_loop.py", "ibrobot_core.control.safety"): LOOP,
     ("ibrobot-plugin-planning/tests/test_guard.py", "ibrobot_core.control.safety"): "what calls the guard",
+    ("ibrobot-plugin-planning/tests/test_followers.py", "ibrobot_core.control.safety"): "what calls the guard",
     ("ibrobot-plugin-mujoco/tests/pick_loop.py", "ibrobot_core.dispatch.smoother"): LOOP,
     (
         "ibrobot-plugin-data/tests/test_interleavings.py",

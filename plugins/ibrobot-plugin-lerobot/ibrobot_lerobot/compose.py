@@ -87,15 +87,15 @@ class Composer:
         first = parts[0]
         if first.image is not None:
             return _image(first, values[first.key], header)
-        found: list[tuple[str, str, Any]] = []
+        placed: list[tuple[str, str, Any]] = []
         for part in parts:
             places, vector = self._places[id(part)], self._slice(part, values[part.key])
             given = [vector] if part.selection.size < 0 else vector.tolist()
-            found += [(*place, value) for place, value in zip(places, given, strict=True)]
+            placed += [(*place, value) for place, value in zip(places, given, strict=True)]
         message_type = MESSAGE_TYPES[first.type]
         if message_type is JointState:
-            return _joint_state(found, header)
-        message: Message = _build(message_type, "", _fields(found), header)
+            return _joint_state(placed, header)
+        message: Message = _build(message_type, "", _fields(placed), header)
         return message
 
     def _action(self, vector: NDArray[Any]) -> dict[str, Message]:
@@ -154,19 +154,19 @@ def _image(part: ObservationPart, array: NDArray[Any], header: Header) -> Image:
     return Image(header, height, width, encoding, rows.shape[1], rows.reshape(-1))
 
 
-def _joint_state(found: list[tuple[str, str, Any]], header: Header) -> JointState:
-    names = tuple(dict.fromkeys(joint for _, joint, _ in found))
+def _joint_state(placed: list[tuple[str, str, Any]], header: Header) -> JointState:
+    names = tuple(dict.fromkeys(joint for _, joint, _ in placed))
     arrays: dict[str, NDArray[np.float64]] = {}
-    for field, joint, value in found:
+    for field, joint, value in placed:
         array = arrays.setdefault(field, np.full(len(names), np.nan))
         array[names.index(joint)] = value
     return JointState(header, names, **arrays)
 
 
-def _fields(found: list[tuple[str, str, Any]]) -> dict[str, Any]:
+def _fields(placed: list[tuple[str, str, Any]]) -> dict[str, Any]:
     """Path -> value, with elements combined into arrays."""
     known: dict[str, Any] = {}
-    for field, element, value in found:
+    for field, element, value in placed:
         if not element:
             known[field] = value
             continue

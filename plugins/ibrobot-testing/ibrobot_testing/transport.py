@@ -15,6 +15,7 @@ from typing import ClassVar, Self, override
 import pytest
 
 from ibrobot_core.api import Context, Payload, Transport, TransportError
+from ibrobot_core.app import LogFormatter
 from ibrobot_testing.suite import Suite, wait_until
 
 _HELD_S = 120.0
@@ -36,7 +37,7 @@ class _Log(logging.Handler):
     def text(self) -> str:
         """What was logged, with tracebacks."""
         while not self._records.empty():
-            self._texts.append(logging.Formatter().format(self._records.get()))
+            self._texts.append(LogFormatter().format(self._records.get()))
         return "\n".join(self._texts)
 
     def __enter__(self) -> Self:

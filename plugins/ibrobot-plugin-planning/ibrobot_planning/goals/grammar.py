@@ -24,8 +24,8 @@ from ibrobot_planning.planner import (
     PoseGoal,
     PositionGoal,
 )
+from ibrobot_planning.world.bounds import FURTHEST
 from ibrobot_planning.world.objects import World
-from ibrobot_planning.world.options import FURTHEST
 
 type Triple = tuple[float, float, float]
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from ibrobot_core.api import PlanCode, PlanningError, Pose, Vector
 from ibrobot_core.app import Bus, NoRequest, Service
 from ibrobot_planning.world.ages import AgeSummary
-from ibrobot_planning.world.options import FURTHEST
+from ibrobot_planning.world.bounds import FURTHEST
 
 FLOOR = "floor"
 """Name of the object that the option `floor` of a planner adds."""

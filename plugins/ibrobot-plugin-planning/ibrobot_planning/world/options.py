@@ -10,13 +10,12 @@ import attrs
 
 from ibrobot_core.api import OptionFault, Options, did_you_mean, documented, option
 from ibrobot_planning.world.ages import WhenStale
+from ibrobot_planning.world.bounds import FURTHEST
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
     from ibrobot_planning.world.objects import WorldObject
 
-FURTHEST = 1000.0
-"""Positions [m] and angles [rad] beyond this are refused as mistakes; distances to them are not computed well."""
 _KEYS = {
     "box": ("size",),
     "sphere": ("radius",),

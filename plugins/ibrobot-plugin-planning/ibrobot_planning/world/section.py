@@ -27,6 +27,7 @@ from ibrobot_core.api import (
 )
 from ibrobot_core.app import Component, NoRequest, RobotConfig, RunView, Service, Subscription
 from ibrobot_planning.world.ages import Age, Limit, Unusable
+from ibrobot_planning.world.bounds import FURTHEST
 from ibrobot_planning.world.hands import hands
 from ibrobot_planning.world.objects import (
     FLOOR,
@@ -41,7 +42,6 @@ from ibrobot_planning.world.objects import (
     WorldObject,
 )
 from ibrobot_planning.world.options import (
-    FURTHEST,
     Added,
     Allowed,
     Attached,

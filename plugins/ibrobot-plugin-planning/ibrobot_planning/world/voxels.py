@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ibrobot_core.api import PointCloud2, Vector
+from ibrobot_planning.world.bounds import FURTHEST
 from ibrobot_planning.world.objects import Voxels
-from ibrobot_planning.world.options import FURTHEST
 
 MOST_POINTS = 10_000_000
 """Points of a cloud, or pixels of an image, beyond this are refused."""
