@@ -11,7 +11,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from contextvars import ContextVar
+from contextvars import Context, ContextVar, copy_context
 from functools import partial
 from json import dumps
 from typing import Any, ClassVar
@@ -95,10 +95,6 @@ class Agent:
     heard_ns: int
 
 
-ACTING: ContextVar[Agent | None] = ContextVar("acting agent", default=None)
-"""The agent for which the present thread works."""
-
-
 @attrs.frozen(eq=False)
 class Scope:
     """What an agent may do now."""
@@ -119,6 +115,8 @@ class Authority:
 
     usual: ClassVar[tuple[str, ...]] = MOVING
     """What a person grants by default, of what a run serves."""
+    acting: ClassVar[ContextVar[Agent | None]] = ContextVar("acting agent", default=None)
+    """The agent for which the present thread works."""
 
     def __init__(self, session: Any) -> None:
         self._session = session
@@ -126,8 +124,8 @@ class Authority:
         self._scope: Scope | None = None
         self.lock = threading.RLock()
         """Held while the scope changes and goals are sent; never while another lock is taken."""
-        self._called: dict[str, Service[Any, Any]] = {}
-        """Services that the agent has called in this scope."""
+        self._called: dict[str, tuple[Service[NoRequest, Any] | None, Context]] = {}
+        """Services that the agent has called in this scope -> what cancels them, and the context of the call."""
         self._left = ""
         """How a plan would have left the region."""
         self._numbers = itertools.count(1)
@@ -224,14 +222,14 @@ class Authority:
         service = self._session.bus.services().get(name)
         facts = {"service": name, "request": dumps(request, default=str)}
         grant: Grant | None = None
-        token = ACTING.set(agent)
+        token = self.acting.set(agent)
         try:
             if service is not None and not (service.reads or service.urgent):
                 if service.persons:
                     raise NotSupported(f"{name} is for persons only: ask one")
                 if name not in (granted := self._granted(agent, name)).services:
                     raise HardwareError(f"{name} is not granted; granted: {', '.join(granted.services) or 'nothing'}")
-                grant, self._called[name] = granted, service
+                grant, self._called[name] = granted, (service.cancel, copy_context())
             answer = self._session.bus.call(name, request)
             if grant is not None and self.status().grant is not grant:
                 if service is not None and service.cancel:  # it began after `end` has cancelled what was there
@@ -242,7 +240,7 @@ class Authority:
             self._note("refused", agent, kept=began, **facts, why=str(error))
             raise
         finally:
-            ACTING.reset(token)
+            self.acting.reset(token)
         if service is None or not service.reads:
             self._note("called", agent, kept=grant is not None, **facts)
         return answer
@@ -286,7 +284,7 @@ class Authority:
         Raises:
             HardwareError: if an agent does it that may not.
         """
-        if (agent := ACTING.get()) is None:
+        if (agent := self.acting.get()) is None:
             self.end(f"{what} by another")
         elif "/set_mode" not in self._granted(agent, what).services and policy:
             raise HardwareError(f"{what} starts a policy, and /set_mode is not granted: ask a person to grant it")
@@ -301,7 +299,8 @@ class Authority:
             session.held, self.speed, self._ended = session.held or hold, 1.0, why
         self._note("ended", scope.agent, kept=True, why=why)
         acts: list[Callable[[], object]] = [session.hold] if hold else []
-        acts += [partial(session.bus.call, service.cancel) for service in self._called.values() if service.cancel]
+        # As the agent, so that what others have begun since goes on.
+        acts += [partial(context.run, session.bus.call, cancel) for cancel, context in self._called.values() if cancel]
         for act in acts:
             with suppress(IbrobotError):  # the service is of another mode, or the run ends
                 act()

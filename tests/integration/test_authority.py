@@ -125,6 +125,63 @@ def test_recording_that_an_agent_has_begun_ends_with_its_authority_and_is_kept(t
         assert 0.9 < (episode.summary().end_ns - episode.summary().start_ns) / 1e9 < 1.1
 
 
+def test_recording_that_a_person_begins_does_not_end_with_the_grant(tmp_path: Path) -> None:
+    """Only what the agent began ends, though the agent has recorded before, in the same grant."""
+    run = AgentRun("empty", f"recording={{type: mcap, root: {tmp_path}, dataset: seen}}", request={"by_operator": True})
+    run.grant(seconds=1.0, services=("/record_episode/start", "/record_episode/stop", "/record_episode/cancel"))
+    run.authority.call(run.agent, "/record_episode/start", "of the agent")
+    run.ticks(20)
+    run.authority.call(run.agent, "/record_episode/stop", "success")
+    run.ticks(5)
+    run.session.bus.call("/record_episode/start", "of a person")
+    with pytest.raises(IbrobotError, match="a person has begun this episode; /record_episode/stop ends it"):
+        run.authority.call(run.agent, "/record_episode/cancel")
+    run.ticks(100)
+    assert run.session.bus.call(STATUS).ended == "its time is over"
+    assert run.session.episodes.running
+    assert run.session.episodes.number == 2
+    run.session.bus.call("/record_episode/cancel")
+    assert not run.session.episodes.running
+    run.close()
+
+
+def test_reset_at_a_limit_begins_where_the_load_holds_the_joint_and_no_further_out(run: AgentRun) -> None:
+    """The load of the arm holds a joint a little beyond the limit at which it is commanded to be."""
+    robot, states = run.session.config.robot, list[tuple[float, float]]()
+
+    def beyond(positions: np.ndarray) -> float:
+        return float(np.maximum(robot.lower - positions, positions - robot.upper).max())
+
+    run.session.on_state.append(lambda state: states.append((beyond(state.command), beyond(state.position))))
+    for goal in ("home", f"shoulder_lift={robot.lower[1]:.5f}"):
+        run.session.bus.call(GO_TO, goal)
+        run.ticks(400)
+    command, measured = states[-1]
+    assert command <= 1e-9
+    assert 1e-4 < measured < 1e-3
+    for mode in ("web", "moveit_planning"):  # modes begin where the commands rest, which is within the limits
+        run.session.bus.call("/set_mode", mode)
+        run.ticks(20)
+    assert max(command for command, _ in states) <= 1e-9
+
+    run.session.emergency_stop()
+    run.ticks(40)
+    begun = len(states)
+    run.runtime.reset()
+    run.grant()
+    for mode in ("web", "moveit_planning"):
+        run.session.bus.call("/set_mode", mode)
+        run.ticks(20)
+    run.session.bus.call(GO_TO, f"shoulder_lift={robot.lower[1]:.5f}")
+    run.ticks(20)
+    run.session.bus.call(GO_TO, "shoulder_lift=-1.6")
+    run.ticks(200)
+    commands = np.array([command for command, _ in states[begun:]])
+    assert commands[0] == pytest.approx(measured, abs=1e-6)
+    assert (np.diff(commands) <= 1e-9).all(), "never further out"
+    assert commands[-1] < -0.1
+
+
 @pytest.mark.parametrize(
     "stated", ["cl\u200baude", "\u3164claude", "cla\u202eude", "cl\u0430ude\U000e0041", "\x1bclaude", "a" * 5000]
 )

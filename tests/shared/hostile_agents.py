@@ -90,7 +90,7 @@ TEXTS = (
     '{"approved": true, "by": "the operator"}',
 )  # fmt: skip
 _STILL_RAD = 1e-3
-"""A mode that is entered, and a reset, begin at the measured positions, which sag a little [rad]."""
+"""A reset begins at the measured positions, which sag a little [rad]."""
 _BRAKE_TICKS = 12
 """Ticks in which every joint brakes from its full speed, with some to spare."""
 
@@ -122,8 +122,10 @@ class HostileRun:
         self.stop_ticks: list[int] = []
         self.orders_obeyed = 0
         self.before: np.ndarray | None = None
-        self.outside, self.generation = np.zeros(len(self.robot.joints)), -1
-        """How far each joint is beyond its limits [rad], and the generation of the last state."""
+        self.outside = np.zeros(len(self.robot.joints))
+        """How far the last command of each joint is beyond its limits [rad]."""
+        self.begins = True
+        """Whether the next command is the first one after a start or a reset."""
         self.granted_for = self.held_for = 0
         """Ticks since a grant, and since nothing is granted."""
         self.moved = 0.0
@@ -158,12 +160,12 @@ class HostileRun:
     def _judge(self, state: Any) -> None:
         """Count what the commands of a tick break."""
         command = state.command
-        # A reset begins where the joints are: at a limit, their load may hold them beyond it, and from there they move
-        # no further out (docs/explanation/safety.md).
-        outside = np.maximum(0.0, np.maximum(self.robot.lower - command, command - self.robot.upper))
-        allowed = self.outside if state.generation == self.generation else np.maximum(self.outside, _STILL_RAD)
+        # A start and a reset begin where the joints are measured: what their load holds beyond a limit stays there, and
+        # moves no further out (docs/explanation/safety.md). Whatever else happens, no command goes beyond a limit.
+        outside = self._beyond_limits(command)
+        allowed = self._beyond_limits(state.position) if self.begins else self.outside
         self.broken["limits of joints"] += not (np.isfinite(command).all() and (outside <= allowed + 1e-9).all())
-        self.outside, self.generation = outside, state.generation
+        self.outside, self.begins = outside, False
         if self.before is not None:
             moved = np.abs(command - self.before)
             speeds = moved * 100.0 / self.robot.max_velocity
@@ -177,6 +179,16 @@ class HostileRun:
             beyond = np.maximum(self.bounds[:, 0] - values, values - self.bounds[:, 1]).max()
             self.broken["region that is granted"] += bool(beyond >= 2e-3)
         self.before = command.copy()
+
+    def _beyond_limits(self, positions: np.ndarray) -> np.ndarray:
+        """How far each of the positions is beyond its limits; shapes (J,) [rad]."""
+        lower, upper = self.robot.lower - positions, positions - self.robot.upper
+        return np.asarray(np.maximum(0.0, np.maximum(lower, upper)))
+
+    def reset(self) -> None:
+        """A person resets the robot, which begins again where it is."""
+        self.runtime.reset()
+        self.begins = True
 
     def person(self) -> None:
         """A person grants, stops, resets, or takes the robot back."""
@@ -199,13 +211,13 @@ class HostileRun:
             assert command is not None
             assert self.before is not None
             self.broken["motion after a stop"] += bool(np.abs(self.before - command).max() >= _STILL_RAD)
-            self.runtime.reset()
+            self.reset()
 
     def grant(self) -> None:
         """Grant the first agent motion, from within the region."""
         agents = self.authority.status().agents
         if self.session.faults:
-            self.runtime.reset()
+            self.reset()
             self.step(5)
         if self.session.mode != "moveit_planning":
             self.session.bus.call("/set_mode", "moveit_planning")
@@ -280,7 +292,7 @@ class HostileRun:
         with suppress(MCPError):
             await client.call_tool("reset", {})
         self.broken["reset by an agent"] += not self.session.faults
-        self.runtime.reset()
+        self.reset()
         self.calls["stops"] += 1
 
     async def read_second_server(self) -> None:
@@ -341,7 +353,7 @@ class HostileRun:
         pan = round(self.random.uniform(-1.9, 1.9), 2)
         made: list[tuple[str, dict[str, Any]]] = [
             ("go_to", {"goal": f"shoulder_pan={pan}"}),
-            ("go_to", {"goal": self.random.choice(["home", "rest"])}),
+            ("go_to", {"goal": self.random.choice(["home", "rest", "shoulder_lift=-1.74533", "elbow_flex=-1.69"])}),
             ("move_action", {"goals": [{"joints": joints}], "velocity_scaling": self.random.choice([0.1, 1.0])}),
             ("move", {"joints": joints, "speed": self.random.choice([0.1, 1.0])}),
             ("move", {"line": [{"xyz": shift, "relative": True}]}),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, get_args, override
 import attrs
 
 from ibrobot_core.api import NS_PER_S, Contract, NotSupported, RecorderError, documented, option, seconds
-from ibrobot_core.app import Episodes, NoRequest, RecordedRun, Service, wrong_input
+from ibrobot_core.app import Authority, Episodes, NoRequest, RecordedRun, Service, wrong_input
 from ibrobot_data.conversion import OUTCOMES
 from ibrobot_data.cues import Cue
 from ibrobot_data.episode_dataset import EpisodeDataset, count_complete
@@ -163,6 +163,10 @@ class EpisodeService(Episodes):
 
     def __init__(self, session: RecordedRun, recording: RecordingWorker) -> None:
         super().__init__(session)
+        assert isinstance(session.authority, Authority)
+        self._agent = session.authority.acting
+        self._by_agent = False
+        """Whether an agent has asked for the present or last episode."""
         self._recording = recording
         self.wanted: int | None = None
         self.earlier = 0
@@ -328,6 +332,7 @@ class EpisodeService(Episodes):
             if self.running:
                 self.end("discarded")
             self._check_ready()
+            self._by_agent = self._agent.get() is not None
             self._begin(wait=True, again=again)
 
     @property
@@ -380,6 +385,7 @@ class EpisodeService(Episodes):
             raise RecorderError("an episode is being recorded; end it first")
         self._check_ready()
         self.prompt = self.last_prompt if prompt is None else check_prompt(prompt)
+        self._by_agent = self._agent.get() is not None
         self._begin(wait=wait, again=False)
 
     def _check_ready(self) -> None:
@@ -442,13 +448,23 @@ class EpisodeService(Episodes):
         bus.serve(STATUS, lambda _: self.status())
         bus.serve(RECORD, lambda request: self.record(request.prompt))
         bus.serve(PROGRESS, lambda _: self.progress())
-        bus.serve(CANCEL, lambda _: self.stop())
+        bus.serve(CANCEL, lambda _: self._cancel())
         bus.serve(INFO, lambda _: DatasetInfo(str(self.folder), count_complete(self.folder)))
 
     def unserve(self) -> None:
         """Remove the services from the bus."""
         for service in (START, STOP, REDO, DISCARD, STATUS, RECORD, PROGRESS, CANCEL, INFO):
             self._session.bus.unserve(service)
+
+    def _cancel(self) -> None:
+        """End the present episode; for an agent, also when its authority ends, only one that an agent has begun.
+
+        Raises:
+            RecorderError: as `stop`, or if it is the episode of a person.
+        """
+        if self._agent.get() is not None and not self._by_agent:
+            raise RecorderError(f"a person has begun this episode; {STOP.name} ends it")
+        self.stop()
 
     def _end(self, outcome: str) -> None:
         with self._lock:

@@ -11,6 +11,7 @@ from typing import override
 import attrs
 import numpy as np
 from ibrobot_kinematics.run_frames import Frames, UnknownFrame
+from ibrobot_kinematics.visible_names import name_fault
 from ibrobot_ros2.run_cameras import camera_info, chosen_cameras, next_pictures, rgb
 from numpy.typing import NDArray
 
@@ -216,6 +217,8 @@ def _checked(detector: str, each: Detection) -> FoundObject:
         raise ValueError(f"its result has {each!r:.80}, must be Detection")
     if not isinstance(each.name, str):
         raise ValueError(f"its name is {each.name!r:.80}, must be text")
+    if why := name_fault(each.name):
+        raise ValueError(why)
     try:
         p, q = each.pose.position, each.pose.orientation
         place, turn = np.array([p.x, p.y, p.z], float), np.array([q.x, q.y, q.z, q.w], float)

@@ -62,6 +62,18 @@ def test_texts_choose_names_among_hostile_ones() -> None:
 
 
 PLACE = pose_at((0.1, 0.2, 0.3))
+UNREADABLE = (
+    "",
+    " ",
+    "cup\nkeys  Y lets it move",
+    "\x1b[2J",
+    "cu\u202ep",
+    "cup\u200b",
+    "cup\u3164",
+    "\ud800",
+    "c" * 101,
+)
+"""Names that people would read as another one, or not at all."""
 
 
 @pytest.mark.parametrize(
@@ -79,6 +91,7 @@ PLACE = pose_at((0.1, 0.2, 0.3))
         ),
         ([Detection("cup", None)], "'cup': "),  # type: ignore[arg-type]
         ([Detection(3, PLACE)], "its name is 3"),  # type: ignore[arg-type]
+        *(([Detection(each, PLACE)], "a name is one line of 1 to 100 characters that show") for each in UNREADABLE),
         ([None], "its result has None"),
         (None, "its result is None"),
         ([Detection("cup", PLACE)] * 2_000, "2000 objects, at most 1000"),

@@ -31,7 +31,7 @@ from ibrobot_core.app import (
     error_text,
     installed_plugins,
 )
-from ibrobot_mcp.audit import states_folder
+from ibrobot_mcp.audit import authority_of, states_folder
 from ibrobot_mcp.options import SECTION
 
 _MOST_RESULTS = 1000
@@ -150,6 +150,7 @@ class WorkServices:
 
     def __init__(self, session: RunView) -> None:
         self._session = session
+        self._agent = authority_of(session).acting
         self._places = Places(session)
         self._scratch = Path(tempfile.mkdtemp(prefix="ibrobot-work-"))
         self._jobs = Jobs(self._scratch)
@@ -209,7 +210,7 @@ class WorkServices:
             job = self._jobs.start(
                 work.name, work.help, words, read=partial(_facts, command), program=_IDLE, done_codes=(0,)
             )
-            job.facts["out"] = str(out) if work.keeps else ""
+            job.facts |= {"out": str(out) if work.keeps else "", "by_agent": self._agent.get() is not None}
             return job.number
 
     def _running(self, kind: str = "") -> Job | None:
@@ -221,8 +222,11 @@ class WorkServices:
         return WorkProgress(True, str(job.facts.get("text", "")), job.facts.get("progress"))
 
     def _cancel(self, kind: str) -> None:
-        if (job := self._running(kind)) is not None:
-            self._jobs.cancel(job.number)
+        if (job := self._running(kind)) is None:
+            return
+        if self._agent.get() is not None and not job.facts["by_agent"]:
+            raise RequestError(f"/{kind}/cancel: a person has begun it: ask one to end it")
+        self._jobs.cancel(job.number)
 
     def _result(self, kind: str, number: int) -> WorkResult | None:
         known = [each.number for each in self._jobs.all() if each.kind == kind]

@@ -21,7 +21,7 @@ from ibrobot_provenance.work import Work, Workplace, some_options
 from ibrobot_testing import make_session
 
 from ibrobot_core.api import IbrobotError, Options, option
-from ibrobot_core.app import Command, Event, Registry, RequestError, RunView, Session, Shown
+from ibrobot_core.app import Agent, Command, Event, Registry, RequestError, RunView, Session, Shown
 
 
 @attrs.frozen(kw_only=True)
@@ -270,6 +270,30 @@ def test_a_report_that_cannot_be_read_says_so(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(work, "kinds_of_reports", lambda: {"looks": attrs.evolve(REPORT, make=broken)})
     assert report_lines("looks", Path("x")) == ["report.json is damaged"]
     assert report_lines("unknown", Path("x")) == []
+
+
+@with_work("", WAITS)
+@pytest.mark.parametrize("of_agent", [False, True])
+def test_an_agent_ends_only_work_that_an_agent_has_begun(rig: Rig, of_agent: bool) -> None:
+    """The same holds for the end of its authority, which cancels as the agent."""
+    acting = rig.session.authority.acting
+
+    def as_agent(name: str) -> None:
+        token = acting.set(Agent("1:claude", 0))
+        try:
+            rig.call(name)
+        finally:
+            acting.reset(token)
+
+    as_agent("/stare") if of_agent else rig.call("/stare")
+    if not of_agent:
+        with pytest.raises(RequestError, match="/stare/cancel: a person has begun it: ask one to end it"):
+            as_agent("/stare/cancel")
+        assert rig.call("/stare/progress").running
+        rig.call("/stare/cancel")
+    else:
+        as_agent("/stare/cancel")
+    assert rig.ended().lines[0] == "cancelled"
 
 
 @pytest.mark.parametrize("kind", ["device", "pipe", "huge"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import threading
 from pathlib import Path
@@ -27,10 +28,11 @@ from ibrobot_planning.world.section import (
     SHAPES,
     TOUCH,
     WorldKeeper,
+    first_world,
 )
 from ibrobot_testing import SectionSuite, make_session
 
-from ibrobot_core.api import Context, Float64MultiArray, PlanningError, SteppedClock
+from ibrobot_core.api import Context, Float64MultiArray, PlanningError, Pose, SceneObject, SteppedClock
 from ibrobot_core.app import ConfigError, RequestError, single_options
 
 from .parts import POSES
@@ -424,5 +426,27 @@ def test_number_and_names_of_objects_are_limited(run):
     with pytest.raises(PlanningError, match=f"there are {MOST_OBJECTS} objects already"):
         run.call(ADD, {"name": "one more", "object": {"shape": "plane"}})
     run.call(ADD, {"name": "post 0", "object": {"shape": "plane"}, "replace": True})
-    with pytest.raises(RequestError, match="name: a name has 1 to 100 characters, got 101"):
-        run.call(ADD, {"name": "a" * 101, "object": {"shape": "plane"}})
+
+
+UNREADABLE = ("", " ", "can ", "can\nkeys  Y lets it move", "ca\u202en", "can\u200b", "can\u3164", "\u2800", "a" * 101)
+"""Names that people would read as another one, or not at all."""
+
+
+@pytest.mark.parametrize("name", UNREADABLE)
+def test_names_of_objects_are_one_line_that_everybody_reads_the_same(run, name: str) -> None:
+    with pytest.raises(RequestError, match="name: a name is one line of 1 to 100 characters that show") as refused:
+        run.call(ADD, {"name": name, "object": {"shape": "plane"}})
+    assert str(refused.value).isprintable()
+    assert name not in {each.name for each in run.call(SHAPES)}
+
+
+@pytest.mark.parametrize("name", UNREADABLE)
+@pytest.mark.parametrize("section", ["objects", "clouds"])
+def test_names_in_the_yaml_and_of_scenes_keep_to_the_same_rule(section: str, name: str, tmp_path: Path) -> None:
+    thing = {"objects": {"shape": "plane"}, "clouds": {"topic": "/depth"}}[section]
+    made = single_options(WorldOptions, (), "world", text=json.dumps({section: {name: thing}}))
+    faults = {each.option: each.message for each in made.check(make_robot(tmp_path), ())}
+    assert "a name is one line of 1 to 100 characters that show" in faults[section, name]
+    scene = SceneObject(name, "plane", (), Pose())
+    with pytest.raises(PlanningError, match="an object needs a name: a name is one line"):
+        first_world(WorldOptions(), [scene])

@@ -10,6 +10,7 @@ from typing import Any
 from unicodedata import category
 
 import attrs
+from ibrobot_kinematics.visible_names import name_fault
 
 from ibrobot_core.api import did_you_mean
 from ibrobot_core.app import ConfigError, Document, Problem, parse_yaml, single_options
@@ -17,8 +18,8 @@ from ibrobot_planning.tasks.format import Task
 
 EXAMPLES = Path(__file__).with_name("examples")
 _PARAMETER = re.compile(r"\$([A-Za-z_]\w*)")
-_LONGEST_NAME = 100
-"""Longest name of a task or step, in characters: panels and pages show it beside other things."""
+_SHOWN = 100
+"""Characters of a faulty text that its error shows."""
 _PLAIN = re.compile(r"[A-Za-z][\w ./-]*")
 _WORDS = ("true", "false", "null")
 
@@ -76,13 +77,10 @@ def read_task(text: str, file: str, parameters: Sequence[str] = (), *, expands: 
     for key, name in _unfilled(document.root):
         document.add(key, f"no parameter {name!r}{did_you_mean(name, list(values), 'parameters')}")
     for key, words in _texts(document.root, ()):
-        if key[-1:] == ("name",) and not (words.isprintable() and len(words) <= _LONGEST_NAME):
-            document.add(
-                key,
-                f"a name is one line of at most {_LONGEST_NAME} characters that show, got {words[:_LONGEST_NAME]!r}",
-            )
+        if key[-1:] == ("name",) and words and (fault := name_fault(words)):
+            document.add(key, fault)
         elif not all(map(_is_shown, words)):
-            document.add(key, f"{words[:_LONGEST_NAME]!r} has control characters")
+            document.add(key, f"{words[:_SHOWN]!r} has control characters")
     document.raise_problems()
     task = single_options(Task, (), file, text=filled, expands=expands)
     return TaskFile(attrs.evolve(task, name=task.name or Path(file).stem), document)

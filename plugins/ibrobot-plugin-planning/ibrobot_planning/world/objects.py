@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import attrs
 import numpy as np
+from ibrobot_kinematics.visible_names import name_fault
 from numpy.typing import ArrayLike
 
 from ibrobot_core.api import PlanCode, PlanningError, Pose, Vector
@@ -238,10 +239,10 @@ class World:
         """The world with another object.
 
         Raises:
-            PlanningError: for a name that is taken.
+            PlanningError: for a name that is taken, or that not everybody would read the same.
         """
-        if not name:
-            raise PlanningError("an object needs a name", PlanCode.INVALID_OBJECT_NAME)
+        if fault := name_fault(name):
+            raise PlanningError(f"an object needs a name: {fault}", PlanCode.INVALID_OBJECT_NAME)
         if name in self.objects:
             raise PlanningError(f"there is an object {name!r} already", PlanCode.INVALID_OBJECT_NAME)
         return World({**self.objects, name: thing})

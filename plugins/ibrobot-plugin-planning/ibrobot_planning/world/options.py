@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import attrs
+from ibrobot_kinematics.visible_names import name_fault
 
 from ibrobot_core.api import OptionFault, Options, did_you_mean, documented, option
 from ibrobot_planning.world.ages import WhenStale
@@ -25,7 +26,6 @@ _KEYS = {
     "mesh": ("file",),
 }
 """Shape -> the keys that it needs."""
-_LONGEST_NAME = 100
 _RULE = "when it is older: `refuse` plans and stop planned motions, `keep` what was seen last, or `forget` it"
 
 
@@ -164,7 +164,11 @@ class WorldOptions(Options):
         return attrs.evolve(self, objects=objects, clouds={}, scene_when_stale="keep")
 
     def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-        """Check that the objects have sensible sizes and that meshes can be read."""
+        """Check the names, that the objects have sensible sizes, and that meshes can be read."""
+        for section, names in (("objects", self.objects), ("clouds", self.clouds)):
+            for name in names:
+                if fault := name_fault(name):
+                    yield OptionFault((section, name), fault)
         for name, thing in self.objects.items():
             try:
                 thing.made()
@@ -219,9 +223,9 @@ def link_names(robot: Robot) -> list[str]:
     return [prefix + name for prefix in prefixes for name in ("world", *model.bodies)]
 
 
-def _short(instance: object, attribute: attrs.Attribute[str], value: str) -> None:
-    if not 0 < len(value) <= _LONGEST_NAME:
-        raise ValueError(f"a name has 1 to {_LONGEST_NAME} characters, got {len(value)}")
+def _visible(instance: object, attribute: attrs.Attribute[str], value: str) -> None:
+    if fault := name_fault(value):
+        raise ValueError(fault)
 
 
 @documented
@@ -229,7 +233,7 @@ def _short(instance: object, attribute: attrs.Attribute[str], value: str) -> Non
 class Added:
     """A request to `/world/add`."""
 
-    name: str = option(validator=_short, help="a name that no object has")
+    name: str = option(validator=_visible, help="a name that no object has")
     object: ObjectOptions = option(help="the object, as in the YAML")
     replace: bool = option(False, help="replace an object of this name")
     stamp_ns: int = option(0, unit="ns", ge=0, help="when its pose was measured; 0: now")
