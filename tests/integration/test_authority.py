@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import closing, suppress
 from contextvars import Context
@@ -13,8 +14,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ibrobot_mcp.work import WorkServices
 
-from ibrobot_core.api import Header, JointState, MoveJoint, String
+from ibrobot_core.api import (
+    FollowTrajectory,
+    Header,
+    JointState,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    MoveJoint,
+    String,
+    ns,
+)
 from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
 from ibrobot_core.contract.specs import joint_selection
 from ibrobot_core.control.commands import LimitSpeed
@@ -29,11 +40,11 @@ AWAY, HERE = "shoulder_pan=1.2", "shoulder_pan=0"
 class AgentRun:
     """A run in lockstep with an agent, whose client gives signs of life at each tick, unless it is `frozen`."""
 
+    config, mode = CONFIG, "moveit_planning"
+
     def __init__(self, scene: str = "empty", *more: str, request: Mapping[str, Any] = MappingProxyType({})) -> None:
         overrides = (f"simulation.scene={{type: {scene}}}", *more)
-        config = load_config(
-            CONFIG, sim=True, mode="moveit_planning", overrides=overrides, registry=installed_plugins()
-        )
+        config = load_config(self.config, sim=True, mode=self.mode, overrides=overrides, registry=installed_plugins())
         self.runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, **request)))
         self.session = self.runtime.session
         self.authority = self.session.authority
@@ -707,3 +718,215 @@ def test_what_is_left_out_last_is_said_at_the_end(run: AgentRun) -> None:
     run.authority.close()
     assert [(each["event"], each["left_out"]) for each in told] == [("closed", {"called": 51})]
     run.authority.open()
+
+
+@pytest.fixture
+def world_run() -> Iterator[AgentRun]:
+    made = AgentRun("pick_cube", "tasks={}", "world={scene: true}")
+    yield made
+    made.close()
+
+
+PERSONS = ("/reset", "/agent/arm", "/world/remove", "/world/move", "/world/attach", "/world/allow")
+"""Services that agents cannot call, whatever was granted."""
+FOR_GRANTS = ("/set_mode", "/execute_trajectory", "/world/add", "/world/detach", "/world/touch")
+"""Services that agents can call only if somebody has granted them by name."""
+
+
+def test_agent_gets_no_service_by_default_that_weakens_a_check(world_run: AgentRun) -> None:
+    services = world_run.session.bus.services()
+    assert {name for name, each in services.items() if each.persons} == set(PERSONS)
+    world_run.session.bus.call(ARM, {"seconds": 60})  # as a person does who names nothing
+    granted = set(world_run.session.bus.call(STATUS).grant.services)
+    open_to_all = {name for name, each in services.items() if each.reads or each.urgent}
+    assert not {name for name in open_to_all if name.startswith("/world/") and not services[name].reads}
+    for name in services.keys() - granted - open_to_all:
+        with pytest.raises(IbrobotError, match=r"is for persons only|is not granted; granted: /planning/go_to"):
+            world_run.authority.call(world_run.agent, name)
+    assert set(FOR_GRANTS) <= services.keys() - granted - open_to_all
+    assert {name for name in granted if name.startswith(("/world/", "/set_mode"))} == set()
+
+
+CUBE = {"shape": "box", "size": [0.01, 0.01, 0.01]}
+BELOW = {"shape": "plane", "position": [0, 0, -0.5]}
+
+
+@pytest.mark.parametrize(
+    ("request_", "why"),
+    [
+        ({"name": "table", "replace": True, "object": BELOW}, "'table' is not of an agent: ask a person to replace it"),
+        ({"name": "cube", "replace": True, "object": CUBE}, "'cube' is not of an agent"),
+        ({"name": "floor", "object": BELOW}, "'floor' is a name for persons only: choose another one"),
+        ({"name": "post", "object": CUBE | {"may_touch": ["gripper"]}}, "may_touch and movable are for persons only"),
+        ({"name": "post", "object": CUBE | {"movable": True}}, "may_touch and movable are for persons only"),
+    ],
+)
+def test_agent_that_may_add_objects_takes_no_obstacle_away(
+    world_run: AgentRun, request_: Mapping[str, Any], why: str
+) -> None:
+    shapes = world_run.session.bus.call("/world/shapes")
+    world_run.grant(services=("/world/add", *PERSONS))
+    with pytest.raises(IbrobotError, match=why):
+        world_run.authority.call(world_run.agent, "/world/add", request_)
+    assert world_run.session.bus.call("/world/shapes") == shapes
+    world_run.session.bus.call("/world/add", {"replace": True} | request_)  # a person may
+
+
+def test_agent_replaces_what_agents_have_added_until_a_person_has(world_run: AgentRun) -> None:
+    world_run.grant(services=("/world/add",))
+    post = {"name": "post", "object": CUBE | {"position": [0.4, 0, 0.3]}, "replace": True}
+    world_run.authority.call(world_run.agent, "/world/add", post)
+    world_run.authority.call(world_run.agent, "/world/add", post)
+    world_run.session.bus.call("/world/attach", {"name": "post"})
+    with pytest.raises(IbrobotError, match="'post' is not of an agent"):  # the hand carries it now
+        world_run.authority.call(world_run.agent, "/world/add", post)
+    world_run.session.bus.call("/world/add", post)
+    with pytest.raises(IbrobotError, match="'post' is not of an agent"):
+        world_run.authority.call(world_run.agent, "/world/add", post)
+
+
+def test_agent_that_puts_down_an_object_does_not_say_what_it_may_touch(world_run: AgentRun) -> None:
+    world_run.session.bus.call("/world/attach", {"name": "cube"})
+    world_run.grant(services=("/world/detach",))
+    with pytest.raises(IbrobotError, match="/world/detach: may_touch is for persons only: leave it out"):
+        world_run.authority.call(world_run.agent, "/world/detach", {"name": "cube", "may_touch": ["gripper"]})
+    world_run.authority.call(world_run.agent, "/world/detach", {"name": "cube"})
+    assert not world_run.session.bus.call("/world/snapshot").objects["cube"].may_touch
+
+
+def test_what_an_agent_lets_the_hand_touch_ends_with_its_grant(world_run: AgentRun) -> None:
+    bus = world_run.session.bus
+
+    def touched() -> bool:
+        return "gripper" in bus.call("/world/snapshot").objects["table"].may_touch
+
+    world_run.grant(services=("/world/touch",))
+    world_run.authority.call(world_run.agent, "/world/touch", {"objects": ["table"]})
+    assert touched()
+    bus.call(DISARM)
+    assert not touched()
+    world_run.grant(services=("/world/touch",))
+    assert not touched(), "the next grant does not bring it back"
+    bus.call("/world/touch", {"objects": ["table"]})
+    bus.call(DISARM)
+    assert touched(), "what a person has said goes on"
+
+
+@pytest.mark.parametrize("carried", [False, True])
+def test_region_holds_for_an_arm_that_carries_an_object(world_run: AgentRun, carried: bool) -> None:
+    """What a person attaches changes nothing of the region, and an agent cannot attach anything."""
+    run, bus = world_run, world_run.session.bus
+    bus.call(GO_TO, "home")
+    run.ticks(400)
+    if carried:
+        bus.call("/world/add", {"name": "pen", "object": CUBE | {"position": [0.4, 0, 0.3]}})
+        bus.call("/world/attach", {"name": "pen"})
+    run.grant(services=(GO_TO, "/world/attach"), region={"position.shoulder_pan": ((-0.3, 0.3),)})
+    with pytest.raises(NotSupported, match="/world/attach is for persons only: ask one"):
+        run.authority.call(run.agent, "/world/attach", {"name": "cube"})
+    run.go("shoulder_pan=0.8")
+    assert run.moved(300) == 0.0
+    run.go("shoulder_pan=0.25")
+    assert run.moved(300) > 0.2
+    assert run.session.bus.call(STATUS).armed == "1:claude"
+
+
+class TwoArms(AgentRun):
+    """Two arms, which a policy moves, or goals of other clients: planners have no goals for two tools."""
+
+    config, mode = CONFIG.with_name("bi_so101_handover.yaml"), "goals"
+
+    def __init__(self) -> None:
+        arms = [f"executors.{side}_trajectory={{type: trajectory, group: {side}}}" for side in ("left", "right")]
+        both = "control_modes.goals={executors: [left_trajectory, right_trajectory]}"
+        super().__init__("handover", *arms, both)
+
+    def send(self, side: str, pan: float, seconds: float = 8.0) -> None:
+        """Send a goal of another client, which turns one arm [rad]."""
+        executor = f"{side}_trajectory"
+        joints = self.session.config.executors[executor].joints
+        there = self.commands[-1][self.session.config.robot.indices(joints)].copy()
+        there[0] = pan
+        points = (JointTrajectoryPoint(ns(seconds), there),)
+        self.session.send_goal(executor, "other", FollowTrajectory(JointTrajectory(Header(), joints, points)))
+
+    def pans(self) -> np.ndarray:
+        """The commands of the pan of the left and the right arm in each tick [rad], shape (N, 2)."""
+        return np.array(self.commands)[
+            :, self.session.config.robot.indices(("left_shoulder_pan", "right_shoulder_pan"))
+        ]
+
+
+@pytest.fixture
+def arms() -> Iterator[TwoArms]:
+    made = TwoArms()
+    yield made
+    made.close()
+
+
+def test_speed_that_is_granted_holds_for_both_arms(arms: TwoArms) -> None:
+    arms.grant(services=("/set_mode",), speed=0.2)
+    arms.authority.call(arms.agent, "/set_mode", "handover")
+    arms.ticks(1000)
+    fastest = np.abs(np.diff(arms.commands, axis=0)).max(axis=0) * 100.0 / arms.session.config.robot.max_velocity
+    assert fastest == pytest.approx(0.2, rel=1e-2), "each joint of both arms is as fast as granted, and not faster"
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_policy_of_two_arms_ends_when_one_leaves_the_region(arms: TwoArms, side: str) -> None:
+    arms.grant(services=("/set_mode",), speed=0.5, region={f"position.{side}_shoulder_pan": ((-0.1, 0.1),)})
+    arms.authority.call(arms.agent, "/set_mode", "handover")
+    arms.ticks(900)
+    assert f"not within the region: {side}_shoulder_pan.pos would be" in arms.session.bus.call(STATUS).ended
+    assert np.abs(arms.pans()[:, int(side == "right")]).max() <= 0.101
+    assert arms.moved(100) == 0.0, "both arms hold"
+
+
+def test_region_of_one_arm_leaves_the_goals_of_the_other_alone(arms: TwoArms) -> None:
+    arms.grant(services=("/set_mode",), speed=0.2, region={"position.left_shoulder_pan": ((-0.3, 0.3),)})
+    with pytest.raises(IbrobotError, match=r"the path leaves the region that is granted: left_shoulder_pan.pos would"):
+        arms.send("left", 0.8)
+    with pytest.raises(IbrobotError, match=r"% of the speed, 20% is granted"):
+        arms.send("right", 0.8, seconds=0.5)
+    assert arms.moved(100) == 0.0
+    arms.send("right", -0.8)
+    arms.send("left", 0.25)
+    arms.ticks(900)
+    assert arms.pans()[-1] == pytest.approx([0.25, -0.8], abs=0.01)
+    assert arms.session.bus.call(STATUS).armed == "1:claude"
+
+
+def test_evaluation_ends_with_the_grant_and_one_of_a_person_goes_on(tmp_path: Path) -> None:
+    run = AgentRun("empty", f"recording={{type: mcap, root: {tmp_path}/episodes, dataset: seen}}")
+    bus, many = run.session.bus, {"episodes": 500, "mode": ["model_inference"]}
+    with closing(WorkServices(run.session)):
+        run.grant(seconds=0.5, services=("/evaluate",))
+        number = run.authority.call(run.agent, "/evaluate", many)
+        run.ticks(30)
+        assert bus.call("/evaluate/progress").running
+        run.ticks(40)
+        assert bus.call(STATUS).ended == "its time is over"
+        jobs_ended()
+        assert bus.call("/evaluate/result", number).lines[0] == "cancelled"
+        assert run.session.held
+        assert run.moved(20) == 0.0
+
+        run.grant(seconds=0.5, services=("/evaluate",))
+        number = run.authority.call(run.agent, "/evaluate", many)
+        run.authority.call(run.agent, "/evaluate/cancel")
+        jobs_ended()
+        bus.call("/evaluate", many)
+        run.ticks(70)
+        assert bus.call(STATUS).ended == "its time is over"
+        assert bus.call("/evaluate/progress").running
+        with pytest.raises(RequestError, match="/evaluate/cancel: a person has begun it"):
+            run.authority.call(run.agent, "/evaluate/cancel")
+        bus.call("/evaluate/cancel")
+        jobs_ended()
+    run.close()
+
+
+def jobs_ended() -> None:
+    for thread in [each for each in threading.enumerate() if each.name.startswith("job ")]:
+        thread.join(30)
+        assert not thread.is_alive()

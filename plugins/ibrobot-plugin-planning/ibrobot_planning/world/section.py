@@ -25,7 +25,7 @@ from ibrobot_core.api import (
     did_you_mean,
     resolve_path,
 )
-from ibrobot_core.app import Component, NoRequest, RobotConfig, RunView, Service, Subscription
+from ibrobot_core.app import Authority, Component, NoRequest, RobotConfig, RunView, Service, Subscription
 from ibrobot_planning.world.ages import Age, Limit, Unusable
 from ibrobot_planning.world.bounds import FURTHEST
 from ibrobot_planning.world.hands import hands
@@ -168,6 +168,10 @@ class WorldKeeper(Component):
         self._world = first_world(options, scene)
         super().__init__("world", f"{len(self._world.objects)} objects for planners", ())
         self._session = session
+        assert isinstance(session.authority, Authority)
+        self._authority = session.authority
+        self._of_agents: set[str] = set()
+        """Names of objects that agents have added."""
         self._lock = threading.RLock()
         self._measuring = threading.Lock()
         self._moving = {thing.name: thing for thing in scene if thing.topic}
@@ -176,6 +180,8 @@ class WorldKeeper(Component):
         self._options = options
         self.ages: dict[str, Age] = {}
         self._touched: tuple[str, ...] = ()
+        self._touched_within: object = None
+        """The grant of the agent that has said so, after which it no longer holds; None for a person."""
         self._services: dict[Service[Any, Any], Callable[[Any], Any]] = {
             SNAPSHOT: lambda _: self._snapshot(),
             OBSERVED: lambda _: self.observed(),
@@ -281,7 +287,8 @@ class WorldKeeper(Component):
 
     def _with_touched(self, world: World) -> World:
         """The world with what the hand may touch for now."""
-        if not self._touched:
+        within, granted = self._touched_within, self._authority.status().grant
+        if not self._touched or (within is not None and within is not granted):
             return world
         hand = frozenset(hands(self._session.config.robot, self._arm))
         carried = {name for name, thing in world.objects.items() if thing.link in hand}
@@ -381,7 +388,22 @@ class WorldKeeper(Component):
         self._no_cloud(it.name)
         return world.move(it.name, pose_at(it.position, it.rpy))
 
+    def _check_of_agent(self, world: World, it: Added) -> None:
+        """Let an agent only add obstacles: what takes one away is for persons, as are `/world/remove` and `allow`.
+
+        Raises:
+            PlanningError: for a request that may let the arm touch more than before.
+        """
+        known = world.objects.get(it.name)
+        if it.replace and known is not None and (known.link is not None or it.name not in self._of_agents):
+            raise PlanningError(f"{ADD.name}: replace: {it.name!r} is not of an agent: ask a person to replace it")
+        if it.name in self._temporary:
+            raise PlanningError(f"{ADD.name}: {it.name!r} is a name for persons only: choose another one")
+        if it.object.may_touch or it.object.movable:
+            raise PlanningError(f"{ADD.name}: may_touch and movable are for persons only: leave them out")
+
     def _add(self, it: Added) -> list[str]:
+        of_agent = self._authority.acting.get() is not None
         try:
             thing = it.object.made()  # outside the lock: reading a mesh is slow, and motions are checked meanwhile
         except ValueError as error:
@@ -389,11 +411,14 @@ class WorldKeeper(Component):
 
         def change(world: World, it: Added) -> World:
             self._no_cloud(it.name)
+            if of_agent:
+                self._check_of_agent(world, it)
             if it.replace and it.name in world.objects:
                 world = world.remove(it.name)
             if len(world.objects) >= MOST_OBJECTS:
                 raise PlanningError(f"there are {MOST_OBJECTS} objects already; checks of more would take too long")
             world = world.add(it.name, thing)
+            self._of_agents = self._of_agents | {it.name} if of_agent else self._of_agents - {it.name}
             meshes = [each.shape for each in world.objects.values() if isinstance(each.shape, Mesh)]
             triangles = sum(len(mesh.triangles) for mesh in meshes)
             if isinstance(thing.shape, Mesh) and triangles > MOST_TRIANGLES:
@@ -437,6 +462,8 @@ class WorldKeeper(Component):
         return world.attach(it.name, link, pose(placed), frozenset((*hand, *it.may_touch)))
 
     def _detach(self, world: World, it: Detached) -> World:
+        if it.may_touch and self._authority.acting.get() is not None:
+            raise PlanningError(f"{DETACH.name}: may_touch is for persons only: leave it out")
         thing = world.named(it.name)
         placed = matrix(thing.pose) if thing.link is None else self._link(thing.link) @ matrix(thing.pose)
         return world.detach(it.name, pose(placed), frozenset(it.may_touch))
@@ -444,7 +471,9 @@ class WorldKeeper(Component):
     def _touch(self, world: World, it: Touched) -> World:
         for name in it.objects:
             world.named(name)
-        self._touched = it.objects
+        self._touched, self._touched_within = it.objects, None
+        if self._authority.acting.get() is not None:
+            self._touched_within = self._authority.status().grant or "a grant that has ended"
         return world
 
     @cached_property
