@@ -747,8 +747,8 @@ def test_agent_gets_no_service_by_default_that_weakens_a_check(world_run: AgentR
     assert {name for name in granted if name.startswith(("/world/", "/set_mode"))} == set()
 
 
-CUBE = {"shape": "box", "size": [0.01, 0.01, 0.01]}
-BELOW = {"shape": "plane", "position": [0, 0, -0.5]}
+CUBE: dict[str, Any] = {"shape": "box", "size": [0.01, 0.01, 0.01]}
+BELOW: dict[str, Any] = {"shape": "plane", "position": [0, 0, -0.5]}
 
 
 @pytest.mark.parametrize(
@@ -774,7 +774,7 @@ def test_agent_that_may_add_objects_takes_no_obstacle_away(
 
 def test_agent_replaces_what_agents_have_added_until_a_person_has(world_run: AgentRun) -> None:
     world_run.grant(services=("/world/add",))
-    post = {"name": "post", "object": CUBE | {"position": [0.4, 0, 0.3]}, "replace": True}
+    post: dict[str, Any] = {"name": "post", "object": CUBE | {"position": [0.4, 0, 0.3]}, "replace": True}
     world_run.authority.call(world_run.agent, "/world/add", post)
     world_run.authority.call(world_run.agent, "/world/add", post)
     world_run.session.bus.call("/world/attach", {"name": "post"})
@@ -898,7 +898,8 @@ def test_region_of_one_arm_leaves_the_goals_of_the_other_alone(arms: TwoArms) ->
 
 def test_evaluation_ends_with_the_grant_and_one_of_a_person_goes_on(tmp_path: Path) -> None:
     run = AgentRun("empty", f"recording={{type: mcap, root: {tmp_path}/episodes, dataset: seen}}")
-    bus, many = run.session.bus, {"episodes": 500, "mode": ["model_inference"]}
+    bus = run.session.bus
+    many: dict[str, Any] = {"episodes": 500, "mode": ["model_inference"]}
     with closing(WorkServices(run.session)):
         run.grant(seconds=0.5, services=("/evaluate",))
         number = run.authority.call(run.agent, "/evaluate", many)
