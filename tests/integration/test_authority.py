@@ -737,7 +737,9 @@ def test_agent_gets_no_service_by_default_that_weakens_a_check(world_run: AgentR
     services = world_run.session.bus.services()
     assert {name for name, each in services.items() if each.persons} == set(PERSONS)
     world_run.session.bus.call(ARM, {"seconds": 60})  # as a person does who names nothing
-    granted = set(world_run.session.bus.call(STATUS).grant.services)
+    grant = world_run.session.bus.call(STATUS).grant
+    assert grant is not None
+    granted = set(grant.services)
     open_to_all = {name for name, each in services.items() if each.reads or each.urgent}
     assert not {name for name in open_to_all if name.startswith("/world/") and not services[name].reads}
     for name in services.keys() - granted - open_to_all:
@@ -769,7 +771,7 @@ def test_agent_that_may_add_objects_takes_no_obstacle_away(
     with pytest.raises(IbrobotError, match=why):
         world_run.authority.call(world_run.agent, "/world/add", request_)
     assert world_run.session.bus.call("/world/shapes") == shapes
-    world_run.session.bus.call("/world/add", {"replace": True} | request_)  # a person may
+    world_run.session.bus.call("/world/add", {"replace": True, **request_})  # a person may
 
 
 def test_agent_replaces_what_agents_have_added_until_a_person_has(world_run: AgentRun) -> None:
@@ -829,6 +831,41 @@ def test_region_holds_for_an_arm_that_carries_an_object(world_run: AgentRun, car
     run.go("shoulder_pan=0.25")
     assert run.moved(300) > 0.2
     assert run.session.bus.call(STATUS).armed == "1:claude"
+
+
+PICK = """
+steps:
+- gripper: {position: 0.6}
+- alternatives:
+  - - move: {object: cube, xyz: [0, 0, 0.07], rpy: [3.14159, 0, 0], angle_tolerance: 0.2}
+    - move: &down {line: [{object: cube, axis: down, angle_tolerance: 0.2}], touch: [cube, table], speed: 0.5}
+  - - move: {object: cube, xyz: [0, 0, 0.07], rpy: [3.14159, 0, 1.5708], angle_tolerance: 0.2}
+    - move: *down
+  - - move: {object: cube, xyz: [0, 0, 0.07], rpy: [3.14159, 0, -1.5708], angle_tolerance: 0.2}
+    - move: *down
+- gripper: {position: -0.1, grasp: cube}
+- move: {line: [{xyz: [0, 0, 0.05], relative: true}], touch: [TOUCHED]}
+"""
+
+
+@pytest.mark.parametrize(("touched", "outcome"), [("table", "FAILED"), ("table, floor", "SUCCEEDED")])
+def test_agent_lifts_a_cube_off_the_floor_of_the_planner(world_run: AgentRun, touched: str, outcome: str) -> None:
+    """The scene has a table, and planners of this robot have a floor at the same height."""
+    world_run.grant(services=("/task/run",), speed=1.0)
+    number = world_run.authority.call(world_run.agent, "/task/run", {"task": PICK.replace("TOUCHED", touched)})
+    for _ in range(30):
+        world_run.ticks(100)
+        if (result := world_run.session.bus.call("/task/result", number)) is not None:
+            break
+    assert result is not None
+    assert result.outcome == outcome
+    assert ("cube is" in result.message and "from floor" in result.message) == (outcome == "FAILED")
+    world = world_run.session.bus.call("/world/observed").world
+    assert "floor" not in world.objects["cube"].may_touch, "the next step may no longer"
+    world_run.session.bus.call("/world/detach", {"name": "cube"})  # from now on it is where the simulation has it
+    world_run.ticks(2)
+    (cube,) = (each for each in world_run.session.bus.call("/world/shapes") if each.name == "cube")
+    assert (cube.pose.position.z > 0.04) == (outcome == "SUCCEEDED")
 
 
 class TwoArms(AgentRun):

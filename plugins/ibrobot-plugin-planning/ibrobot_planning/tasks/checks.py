@@ -25,7 +25,7 @@ from ibrobot_planning.tasks.format import (
     Step,
 )
 from ibrobot_planning.tasks.reading import TaskFile
-from ibrobot_planning.world.objects import World
+from ibrobot_planning.world.objects import FLOOR, World
 
 if TYPE_CHECKING:
     from ibrobot_planning.goals.tool import Tool
@@ -190,7 +190,8 @@ class _Checks:
         for at, goal in _goals(key, step):
             known &= self._goal(at, goal)
         for i, name in enumerate(step.touch):
-            self._object((*key, "touch", i), name)
+            if name != FLOOR:
+                self._object((*key, "touch", i), name)
         if known and len(self._document.problems) == before:
             self._reach(key, step)
 

@@ -286,7 +286,9 @@ class Detached:
 class Touched:
     """A request to `/world/touch`, in place of the previous one."""
 
-    objects: tuple[str, ...] = option((), help="objects that the hand, and what it carries, may touch")
+    objects: tuple[str, ...] = option(
+        (), help="objects that the hand, and what it carries, may touch; `floor`: what it carries, that of a planner"
+    )
 
 
 @documented

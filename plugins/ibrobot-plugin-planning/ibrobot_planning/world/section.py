@@ -296,6 +296,9 @@ class WorldKeeper(Component):
         for name in (name for name in self._touched if name in objects):
             touching = objects[name].may_touch | hand | carried - {name}
             objects[name] = attrs.evolve(objects[name], may_touch=touching)
+        if FLOOR in self._touched and FLOOR not in objects:  # planners add it, so that nothing is known of it here
+            for name in carried:
+                objects[name] = attrs.evolve(objects[name], may_touch=objects[name].may_touch | {FLOOR})
         return World(objects)
 
     def _observed(self) -> World:
@@ -470,7 +473,8 @@ class WorldKeeper(Component):
 
     def _touch(self, world: World, it: Touched) -> World:
         for name in it.objects:
-            world.named(name)
+            if name != FLOOR:
+                world.named(name)
         self._touched, self._touched_within = it.objects, None
         if self._authority.acting.get() is not None:
             self._touched_within = self._authority.status().grant or "a grant that has ended"
