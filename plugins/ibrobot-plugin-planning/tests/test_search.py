@@ -101,3 +101,9 @@ def test_the_estimated_time_is_about_that_of_the_motion(path):
     )
     motion = timed(way, PACE.velocity, PACE.acceleration, blends=blends, window=0.01, step=0.01)
     assert PACE.time(way) == pytest.approx(motion.duration, rel=0.12)
+
+
+def test_time_of_a_path_with_a_point_twice_is_that_without_it() -> None:
+    once, twice = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
+    assert PACE.time(twice) == pytest.approx(PACE.time(once), abs=1e-5)
+    assert PACE.time(np.zeros((2, 2))) == pytest.approx(0.0, abs=1e-6)

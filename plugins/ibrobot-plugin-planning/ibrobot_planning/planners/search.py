@@ -117,8 +117,9 @@ class Pace:
         lengths = np.sqrt((steps * steps).sum(axis=1)) + 1e-12
         directions = steps / lengths[:, None]
         across = np.abs(directions)
-        tops = 1 / (across / self.velocity).max(axis=1)
-        rates = 1 / (across / self.acceleration).max(axis=1)
+        # A point may come twice: from beyond a limit, the way in ends at that limit, where the goal may be.
+        tops = 1 / np.maximum((across / self.velocity).max(axis=1), 1e-12)
+        rates = 1 / np.maximum((across / self.acceleration).max(axis=1), 1e-12)
         if len(steps) == 1:
             return _travel(float(lengths[0]), 0.0, 0.0, float(tops[0]), float(rates[0]))
         turns = (np.abs(directions[1:] - directions[:-1]) / self.acceleration).max(axis=1) + 1e-12
