@@ -193,7 +193,7 @@ def test_checks_that_need_a_hook_are_listed(site: Site, tmp_path: Path, monkeypa
     monkeypatch.setenv("PYTHONPATH", str(folder))
     as_source(site, folder)
     check = checks()["not checked"]
-    assert (check.found, check.matters) == ("the suite overrides no another, reference", False)
+    assert (check.found, check.matters) == ("the suite overrides no another", False)
     assert check.remedy == "how-to/test-a-plugin says what each makes the device do"
 
 
