@@ -401,7 +401,7 @@ def _offered(manager: pluggy.PluginManager, hook: str, expected: type[Any] | Non
         raise TypeError("it returned None: yield what it offers")
     offers = [each for result in results for each in result]
     for each in offers:
-        if not isinstance(each, expected):
+        if not isinstance(each, expected) or (expected is descriptors.Descriptor and type(each) is not expected):
             raise TypeError(f"expected a {expected.__name__}, got {each!r}")
         for field in attrs.fields(type(each)):
             if not isinstance(value := getattr(each, field.name), _CLASSES.get(field.type, object)):
