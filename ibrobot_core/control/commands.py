@@ -17,7 +17,7 @@ from ibrobot_core.options import fields
 
 @attrs.frozen
 class SwitchMode:
-    """Enter a mode at the measured positions."""
+    """Enter a mode where the commands rest."""
 
     mode: str
 

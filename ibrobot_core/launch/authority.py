@@ -300,7 +300,7 @@ class Authority:
         self._note("ended", scope.agent, kept=True, why=why)
         acts: list[Callable[[], object]] = [session.hold] if hold else []
         # As the agent, so that what others have begun since goes on.
-        acts += [partial(context.run, session.bus.call, cancel) for cancel, context in self._called.values() if cancel]
+        acts += [partial(ctx.run, session.bus.call, cancel) for cancel, ctx in list(self._called.values()) if cancel]
         for act in acts:
             with suppress(IbrobotError):  # the service is of another mode, or the run ends
                 act()

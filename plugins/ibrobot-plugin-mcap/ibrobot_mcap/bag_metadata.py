@@ -41,11 +41,11 @@ def read_bag_info(path: Path) -> BagInfo | None:
     Raises:
         RecorderError: if it cannot be read.
     """
-    if not path.exists():
-        return None
-    if not path.is_file():  # a device has no end, and a pipe none that comes
-        raise RecorderError(f"{path}: is not a file")
     try:
+        if not path.exists():
+            return None
+        if not path.is_file():  # a device has no end, and a pipe none that comes
+            raise RecorderError(f"{path}: is not a file")
         with path.open("rb") as file:
             content = file.read(_LARGEST + 1)
         if len(content) > _LARGEST:

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_mcap import ibrobot_readers
+from ibrobot_mcap.bag_metadata import read_bag_info
 from ibrobot_mcap.checks import problems_of
 from ibrobot_mcap.draft import draft
 from ibrobot_mcap.reader import Rosbag2Reader, is_rosbag2
@@ -168,6 +169,12 @@ def test_metadata_that_would_fill_the_memory_is_not_read(tmp_path, kind, why):
         path.symlink_to(kind)
     with pytest.raises(RecorderError, match=f"metadata.yaml: {why}"):
         Rosbag2Reader(tmp_path)
+
+
+def test_metadata_that_cannot_be_reached_are_an_error_of_the_recording(tmp_path):
+    path = tmp_path / ("a" * 300) / "metadata.yaml"
+    with pytest.raises(RecorderError, match=r"metadata\.yaml: cannot be read: "):
+        read_bag_info(path)
 
 
 def test_bags_are_known_by_their_looks(tmp_path, bench):

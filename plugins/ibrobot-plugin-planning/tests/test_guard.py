@@ -365,9 +365,7 @@ ODD_NAMES = ("cloud in tray", "cloud", "floor", "floor of the world")
 CELLS = np.array([[15, 0, 5], [18, 0, 5], [30, 0, 5]])
 
 
-@pytest.mark.parametrize(
-    "others", list(itertools.permutations(("cloud in tray", "cloud", "floor", "floor of the world")))
-)
+@pytest.mark.parametrize("others", list(itertools.permutations(ODD_NAMES)))
 def test_no_object_takes_the_place_of_another_one(tmp_path, others: tuple[str, ...]) -> None:
     """Whatever names they have: also those that the guard gives to the parts of a cloud, and beside the table."""
     loop = Loop(tmp_path, floor=0.0, regions={"tray": RegionOptions((0.14, -0.1, 0.0), (0.2, 0.1, 0.3))})
@@ -380,6 +378,28 @@ def test_no_object_takes_the_place_of_another_one(tmp_path, others: tuple[str, .
     assert sum(isinstance(thing.shape, Plane) for thing in known) == 1
     cells = [thing.shape.cells.tolist() for thing in known if isinstance(thing.shape, Voxels)]
     assert sorted(itertools.chain(*cells)) == CELLS.tolist()
+
+
+@pytest.mark.parametrize("names", list(itertools.permutations(("a", "b", "a and b"))))
+def test_cells_of_one_region_do_not_take_the_place_of_those_of_two(tmp_path, names: tuple[str, ...]) -> None:
+    left, right = ((0.14, -0.1, 0.0), (0.17, 0.1, 0.3)), ((0.17, -0.1, 0.0), (0.2, 0.1, 0.3))
+    regions = {name: RegionOptions(*(right if name == "a and b" else left)) for name in names}
+    loop = Loop(tmp_path, regions=regions)
+    known = loop.guard._permissions.applied(World({"cloud": WorldObject(Voxels(0.01, CELLS))})).objects.values()
+    cells = [thing.shape.cells.tolist() for thing in known if isinstance(thing.shape, Voxels)]
+    assert sorted(cells) == sorted([each] for each in CELLS.tolist())
+
+
+def test_clouds_do_not_take_the_place_of_parts_of_others(tmp_path) -> None:
+    everywhere = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    loop = Loop(
+        tmp_path, regions={"tray": RegionOptions(*everywhere), "x in tray": RegionOptions((-1, -1, -1), (0, 0, 0))}
+    )
+    clouds = {"cloud": [[-15, -5, -5]], "cloud in x": [[15, 0, 5]]}
+    things = {name: WorldObject(Voxels(0.01, np.array(cells))) for name, cells in clouds.items()}
+    known = loop.guard._permissions.applied(World(things)).objects.values()
+    cells = [thing.shape.cells.tolist() for thing in known if isinstance(thing.shape, Voxels)]
+    assert sorted(cells) == sorted(clouds.values())
 
 
 def test_cells_in_several_regions_may_be_touched_by_the_links_of_each(tmp_path) -> None:

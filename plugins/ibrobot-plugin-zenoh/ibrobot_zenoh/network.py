@@ -119,7 +119,7 @@ class Link(Protocol):
 
     @property
     def transport(self) -> Transport:
-        """It."""
+        """The transport, from its start to its stop."""
 
 
 def transport_of(link: Link) -> TopicTransport:

@@ -45,7 +45,7 @@ class TeleopSuite(Suite[Teleop]):
 
     def operate(self, teleop: Teleop) -> None:
         """The operator, with the deadman pressed, commands motion."""
-        raise NotImplementedError(f"{type(self).__name__} must define self.operate(teleop)")
+        raise NotImplementedError(f"{type(self).__name__} must define operate(self, teleop)")
 
     def hold(self, teleop: Teleop) -> None:
         """One period in which the operator keeps the deadman pressed and commands motion, and the device reports it.

@@ -90,7 +90,7 @@ class ListEpisodes:
 
 
 def _short_name(episode: Path) -> str:
-    """The shortest name of an episode that every command takes: `find_episode` gives its path."""
+    """The shortest name of an episode that every command takes: `EpisodeAddress.find` gives its path."""
     numbered = re.fullmatch(r"episode_(\d{6,})", episode.name)
     if numbered is not None and episode.parent.name == "episodes":
         dataset = episode.parents[1]

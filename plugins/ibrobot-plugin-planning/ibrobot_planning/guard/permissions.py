@@ -51,19 +51,17 @@ class Permissions:
             own = name
             if self._fixed and name in (FLOOR, _OTHER_FLOOR):
                 own = _OTHER_FLOOR if name == FLOOR else _new_name(name, world.objects)
-            objects |= self._permitted(name, own, thing, world.objects.keys())
+            for known, part in self._permitted(name, own, thing):
+                objects[known if known == own else _new_name(known, world.objects.keys() | objects.keys())] = part
         return World(objects)
 
-    def _permitted(
-        self, name: str, own: str, thing: WorldObject, taken: Collection[str]
-    ) -> Iterator[tuple[str, WorldObject]]:
+    def _permitted(self, name: str, own: str, thing: WorldObject) -> Iterator[tuple[str, WorldObject]]:
         """An object with what may touch it; the cells that lie in the same regions are an object of their own.
 
         Args:
             name: its name in the world.
             own: its name in the guard, unless it is divided.
             thing: the object.
-            taken: names of other objects.
         """
         free = self._options.free
         if free is not None:
@@ -85,7 +83,7 @@ class Permissions:
             for _, box in within:
                 part = _touchable(part, self._hands if box.links is None else box.links)
             if within and isinstance(thing.shape, Voxels):
-                yield _new_name(f"{name} in {' and '.join(region for region, _ in within)}", taken), part
+                yield f"{name} in {' and '.join(region for region, _ in within)}", part
             else:
                 yield own, part
 

@@ -57,7 +57,7 @@ export class View {
 
   // What was shown is of another choice.
   renew() {
-    replace(this.change, );
+    replace(this.change);
     if (this.linked && this.checkpoint.value && this.robot.value) this.preview();
   }
 
@@ -76,7 +76,7 @@ export class View {
       class: "primary", disabled: !this.ui.drives || found.problems.length > 0 || !found.diff.length,
       onclick: () => this.write(request, found),
     }, found.new ? `Write the new file ${found.target}` : `Write the file ${found.target}`);
-    replace(this.change, 
+    replace(this.change,
       found.diff.length ? h("pre", { class: "diff", tabindex: "0", "aria-label": "Change" }, found.diff.map((line) => (
         h("span", { class: line.startsWith("+") ? "added" : line.startsWith("-") ? "removed" : "" }, `${line}\n`))))
         : h("p", { class: "note" }, "The robot has this policy already."),
