@@ -462,15 +462,15 @@ class EpisodeService(Episodes):
         Raises:
             RecorderError: as `stop`, or if it is the episode of a person.
         """
-        if self._agent.get() is not None and not self._by_agent:
-            raise RecorderError(f"a person has begun this episode; {STOP.name} ends it")
-        self.stop()
+        self._end("unknown", spares_persons=self._agent.get() is not None)
 
-    def _end(self, outcome: str) -> None:
-        with self._lock:
+    def _end(self, outcome: str, *, spares_persons: bool = False) -> None:
+        with self._lock:  # also for the check: a person may just begin the next one
             self._check_by_operator()
             if not (self.running or self.waiting):
                 raise RecorderError("no episode is being recorded")
+            if spares_persons and not self._by_agent:
+                raise RecorderError(f"a person has begun this episode; {STOP.name} ends it")
             self.waiting = False
             self.end(outcome)
 
