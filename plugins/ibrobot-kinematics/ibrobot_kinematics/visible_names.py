@@ -6,7 +6,9 @@ import re
 
 _LONGEST = 100
 """Longest name, in characters: panels and pages show it beside other things."""
-_UNSEEN = re.compile("[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\uffa0]")
+_UNSEEN = re.compile(
+    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\uffa0\U000e0100-\U000e01ef]"
+)
 """Characters that count as printable and show nothing, so that two names would look the same."""
 
 
