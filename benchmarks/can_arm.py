@@ -1,4 +1,4 @@
-"""The arm with CAN motors on emulated ones: a tick's time on the wire, and how late its control loop is.
+"""The arm with CAN motors, on an emulator: the time of a read, and how late its control loop is.
 
     python benchmarks/can_arm.py
 

@@ -1,8 +1,6 @@
 """The reference page that lists what each package offers, from the plugins' descriptors.
 
-    python docs/plugin_index.py
-
-prints it as Markdown, for the packages that are installed beside this Python.
+`python docs/plugin_index.py` prints it as Markdown, for the packages of the environment of this Python.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ def plugin_page() -> Iterator[str]:
     shown = sorted((packages.get(name, CORE), name) for name in managers)
     shown.sort(key=lambda pair: pair[0] != CORE)
     yield "# Plugins\n"
-    yield "This page lists what core and the plugins that are installed with it offer. Each type links to its"
+    yield "This page lists what core and the installed plugins offer. Each type links to its"
     yield "options. `ibrobot plugins` prints the list for your own installation.\n"
     yield from _needs(sorted({package for package, _ in shown if package != CORE}))
     for package, name in shown:
@@ -40,7 +38,7 @@ def plugin_page() -> Iterator[str]:
 
 
 def _needs(plugins: list[str]) -> Iterator[str]:
-    """A table of the packages: which core they permit, and what else they need of the project, from their metadata."""
+    """A table of the packages: the versions of core that they work with, and the project's packages that they need."""
     yield "| package | version | works with | needs |"
     yield "|---|---|---|---|"
     for plugin in plugins:

@@ -12,7 +12,7 @@ from ibrobot_core.units import ns
 _EXCHANGED_RAD = 0.1
 """Distance from their own setpoints from which joints may be exchanged [rad]."""
 _EXCHANGED_S = 0.3
-"""How long exchanged joints move as each other's before it is a fault [s]; joints that are late alike pass sooner."""
+"""How long joints follow each other's commands before they count as exchanged [s]; lagging joints do so for less."""
 
 
 class FollowingError:

@@ -79,7 +79,7 @@ class EpisodeAddress:
     def find(path: Path) -> Path:
         """The folder of a recorded episode that a short name means; any other path as it is.
 
-        `ROOT/pick:1` is `ROOT/pick/episodes/episode_000001`, and `pick:1` alone also that below `episodes`.
+        `ROOT/pick:1` is `ROOT/pick/episodes/episode_000001`, and `pick:1` is also looked up below `episodes`.
         """
         named = _NUMBERED.fullmatch(path.name)
         if named is None or path.exists():

@@ -107,12 +107,12 @@ class Teleop(ABC):
         return ""
 
     def begin_operation(self, measured: JointReading) -> None:
-        """Let it start from the measured position, with its deadman disarmed."""
+        """Activate the device at the measured position, with its deadman disarmed."""
         self.deadman.disarm(measured.stamp_ns)
         self.activate(measured)
 
     def operate(self, measured: JointReading) -> TeleopCommand:
-        """Its command, without positions that its deadman does not allow.
+        """Read its command; positions that its deadman does not allow are left out.
 
         Raises:
             TeleopError: as `read`, or if the device commands positions and never reports its deadman.
@@ -130,7 +130,7 @@ class Teleop(ABC):
         if not deadman.reported:
             raise TeleopError(
                 f"{type(self).__name__} commands positions without a deadman: its read must call self.deadman.report, "
-                "or its class say operated = False"
+                "or its class must set operated = False"
             )
         return attrs.evolve(command, positions=None)
 

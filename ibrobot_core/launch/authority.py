@@ -155,7 +155,7 @@ class Authority:
             self._note("closed", Agent("", 0), kept=True)
 
     def join(self, name: str) -> Agent:
-        """Connect an agent, which may then read and stop; of its name, what everybody reads the same is kept."""
+        """Connect an agent, which may then read and stop; its name keeps ASCII letters, digits, `-_.`, at most 40."""
         plain = "".join(each for each in name if each.isascii() and (each.isalnum() or each in "-_."))[:40]
         agent = Agent(f"{next(self._numbers)}:{plain or 'agent'}", self._session.clock.now_ns())
         self._agents.append(agent)

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Times the first hour with ibrobot, and with LeRobot alone, from nothing to a policy that acts: one line a step, with
-# the time, the time of all steps so far, the processors' time, which other work on the machine hardly changes, and the load.
+# Times the first hour with ibrobot, and with LeRobot alone, from nothing to a policy that acts. Each step prints a line
+# with its time, the time of all steps so far, its CPU time, which other work on the machine hardly changes, and the load.
 #
 #   first_hour.sh FOLDER
 #
-# FOLDER is made: a clone of this checkout, as committed, an environment of each program, and what they record. Both
-# train the same ACT with two pictures on the same dataset, with the same options. Needs uv, git, OpenGL (libegl1,
+# FOLDER must not exist. It gets a clone of this checkout, as committed, an environment of each program, and what they
+# record. Both train the same ACT with two pictures on the same dataset, with the same options. Needs uv, git, OpenGL (libegl1,
 # libopengl0, libgl1-mesa-dri), and a C compiler, which LeRobot's `evdev` asks for.
 # Exits with 1 if a step fails.
 set -uo pipefail
@@ -20,7 +20,7 @@ export OMP_WAIT_POLICY=PASSIVE HF_HUB_OFFLINE=1
 TRAIN=(--policy.pretrained_backbone_weights=null --policy.device=cpu)
 STEPS=${STEPS:-50} BATCH=${BATCH:-2}
 
-# Processors' time of all children so far [s], as `times` of this shell wrote it.
+# CPU time of all children so far [s], as `times` of this shell wrote it.
 spent_of() { awk 'NR == 2 {gsub("[ms]", " "); print $1 * 60 + $2 + $3 * 60 + $4}' "$folder/times"; }
 step() {
   local name=$1 begin end seconds before after

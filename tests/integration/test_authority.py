@@ -145,7 +145,7 @@ def test_recording_that_a_person_begins_does_not_end_with_the_grant(tmp_path: Pa
     run.authority.call(run.agent, "/record_episode/stop", "success")
     run.ticks(5)
     run.session.bus.call("/record_episode/start", "of a person")
-    with pytest.raises(IbrobotError, match="a person has begun this episode; /record_episode/stop ends it"):
+    with pytest.raises(IbrobotError, match="a person began this episode; /record_episode/stop ends it"):
         run.authority.call(run.agent, "/record_episode/cancel")
     run.ticks(100)
     assert run.session.bus.call(STATUS).ended == "its time is over"
@@ -957,7 +957,7 @@ def test_evaluation_ends_with_the_grant_and_one_of_a_person_goes_on(tmp_path: Pa
         run.ticks(70)
         assert bus.call(STATUS).ended == "its time is over"
         assert bus.call("/evaluate/progress").running
-        with pytest.raises(RequestError, match="/evaluate/cancel: a person has begun it"):
+        with pytest.raises(RequestError, match="/evaluate/cancel: a person began it"):
             run.authority.call(run.agent, "/evaluate/cancel")
         bus.call("/evaluate/cancel")
         jobs_ended()

@@ -50,7 +50,10 @@ class TreeJoint:
 
 @attrs.frozen
 class Follower:
-    """How a joint follows another one, e.g. the second finger of a gripper: by displacements from the references."""
+    """How a joint follows another one, e.g. the second finger of a gripper.
+
+    With q and L as displacements of joint and leader from their reference positions, q = offset + factor * L.
+    """
 
     leader: str
     factor: float

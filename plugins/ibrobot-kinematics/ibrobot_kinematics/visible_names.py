@@ -13,8 +13,8 @@ _UNSEEN = re.compile(
 
 
 def name_fault(name: str) -> str:
-    """Why a text is no name; empty if it is one: one line of 1 to 100 characters that show, without spaces around."""
+    """Why a text is no name; empty if it is one: one line of 1 to 100 visible characters, without spaces around."""
     if 0 < len(name) <= _LONGEST and name.isprintable() and name == name.strip() and not _UNSEEN.search(name):
         return ""
     got = ascii(name[:_LONGEST])
-    return f"a name is one line of 1 to {_LONGEST} characters that show, without spaces around it, got {got}"
+    return f"a name is one line of 1 to {_LONGEST} visible characters, without spaces around it, got {got}"

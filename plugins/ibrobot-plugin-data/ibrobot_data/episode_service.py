@@ -457,7 +457,7 @@ class EpisodeService(Episodes):
             self._session.bus.unserve(service)
 
     def _cancel(self) -> None:
-        """End the present episode; for an agent, also when its authority ends, only one that an agent has begun.
+        """End the present episode. An agent, or the end of its authority, ends only episodes that an agent began.
 
         Raises:
             RecorderError: as `stop`, or if it is the episode of a person.
@@ -470,7 +470,7 @@ class EpisodeService(Episodes):
             if not (self.running or self.waiting):
                 raise RecorderError("no episode is being recorded")
             if spares_persons and not self._by_agent:
-                raise RecorderError(f"a person has begun this episode; {STOP.name} ends it")
+                raise RecorderError(f"a person began this episode; {STOP.name} ends it")
             self.waiting = False
             self.end(outcome)
 

@@ -91,7 +91,7 @@ UNREADABLE = (
         ),
         ([Detection("cup", None)], "'cup': "),  # type: ignore[arg-type]
         ([Detection(3, PLACE)], "its name is 3"),  # type: ignore[arg-type]
-        *(([Detection(each, PLACE)], "a name is one line of 1 to 100 characters that show") for each in UNREADABLE),
+        *(([Detection(each, PLACE)], "a name is one line of 1 to 100 visible characters") for each in UNREADABLE),
         ([None], "its result has None"),
         (None, "its result is None"),
         ([Detection("cup", PLACE)] * 2_000, "2000 objects, at most 1000"),

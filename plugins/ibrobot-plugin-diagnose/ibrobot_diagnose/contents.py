@@ -122,7 +122,7 @@ def read_sections(
     try:
         return contents(facts)
     except KeyError as error:
-        raise DatasetError(f"{file}: is not {what} of this version: it has no {error}; make it again") from None
+        raise DatasetError(f"{file}: is not {what} of this version: it lacks {error}; make it again") from None
     except (IndexError, TypeError, ValueError, AttributeError) as error:
         raise DatasetError(f"{file}: is not {what}: {error!r}") from None
 

@@ -69,7 +69,7 @@ def test_a_link_in_a_folder_that_is_not_there_is_refused(tmp_path: Path) -> None
     command = (*ibrobot_command(), "feetech", "emulate", "--link", str(tmp_path / "missing" / "arm"))
     ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert ran.returncode == 2
-    assert f"you cannot write into {tmp_path / 'missing'}, or it is not a folder" in ran.stderr
+    assert f"{tmp_path / 'missing'} is not a folder that you can write into" in ran.stderr
 
 
 def test_a_hand_swings_the_joints_that_have_no_torque() -> None:

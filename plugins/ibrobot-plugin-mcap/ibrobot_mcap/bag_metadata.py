@@ -49,7 +49,7 @@ def read_bag_info(path: Path) -> BagInfo | None:
         with path.open("rb") as file:
             content = file.read(_LARGEST + 1)
         if len(content) > _LARGEST:
-            raise RecorderError(f"{path}: is larger than {_LARGEST >> 20} MiB, which no metadata of a bag is")
+            raise RecorderError(f"{path}: is larger than {_LARGEST >> 20} MiB, too large for a bag's metadata")
         return parse_bag_info(content.decode(), path)
     except (OSError, UnicodeDecodeError) as error:
         raise RecorderError(f"{path}: cannot be read: {error}") from error

@@ -155,7 +155,7 @@ def test_metadata_that_is_none_is_refused(tmp_path, text):
     [
         ("/dev/zero", "is not a file"),
         ("pipe", "is not a file"),
-        ("huge", "is larger than 16 MiB, which no metadata of a bag is"),
+        ("huge", "is larger than 16 MiB, too large for a bag's metadata"),
     ],
 )
 def test_metadata_that_would_fill_the_memory_is_not_read(tmp_path, kind, why):

@@ -225,7 +225,7 @@ class WorkServices:
         if (job := self._running(kind)) is None:
             return
         if self._agent.get() is not None and not job.facts["by_agent"]:
-            raise RequestError(f"/{kind}/cancel: a person has begun it: ask one to end it")
+            raise RequestError(f"/{kind}/cancel: a person began it: ask a person to end it")
         self._jobs.cancel(job.number)
 
     def _result(self, kind: str, number: int) -> WorkResult | None:
@@ -279,7 +279,7 @@ def _found(job: Job) -> WorkResult:
 
 
 def unreadable(folder: Path) -> str:
-    """Why a folder of results is not read: it may come from elsewhere, and what fills the memory ends the run."""
+    """Why a folder of results is not read: a foreign file could fill the memory, which would end the run."""
     for each in sorted(folder.glob("*.json*")):
         if not each.is_file() or each.stat().st_size > _LARGEST:
             return f"{each}: is not a file of at most {_LARGEST >> 20} MiB"

@@ -287,7 +287,7 @@ def test_an_agent_ends_only_work_that_an_agent_has_begun(rig: Rig, of_agent: boo
 
     as_agent("/stare") if of_agent else rig.call("/stare")
     if not of_agent:
-        with pytest.raises(RequestError, match="/stare/cancel: a person has begun it: ask one to end it"):
+        with pytest.raises(RequestError, match="/stare/cancel: a person began it: ask a person to end it"):
             as_agent("/stare/cancel")
         assert rig.call("/stare/progress").running
         rig.call("/stare/cancel")

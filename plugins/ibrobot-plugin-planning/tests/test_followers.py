@@ -115,7 +115,7 @@ def test_the_guard_keeps_what_follows_off_objects(tmp_path, caplog) -> None:
     guard = ClearanceGuard(
         ClearanceGuardOptions(), Context("guard", SteppedClock(7), logging.getLogger("test"), robot, JOINTS)
     )
-    assert "joints that the robot does not have to stay at their reference position: tilt" in caplog.text
+    assert "joints of the model that the robot lacks at their reference position: tilt" in caplog.text
     opened, closed = np.array([1.0, 0.0, 1.2]), np.array([1.0, 0.0, 0.1])
     thumb = guard._arm.link_pose("thumb", opened) @ [0.0, 0.0, 0.06, 1.0]
     post = box(*thumb[:3], 0.02, 0.02, 0.02)

@@ -280,7 +280,7 @@ def test_malformed_tasks_are_refused(check: Check, text: str, message: str):
 def test_names_are_one_line_that_everybody_reads_the_same(check: Check, text: str, hostile: str):
     with pytest.raises(ConfigError) as failure:
         check(text.format(json.dumps(hostile)))
-    assert "name: a name is one line of 1 to 100 characters that show" in str(failure.value)
+    assert "name: a name is one line of 1 to 100 visible characters" in str(failure.value)
 
 
 def test_other_texts_have_several_lines_but_no_control_characters():

@@ -434,7 +434,7 @@ UNREADABLE = ("", " ", "can ", "can\nkeys  Y lets it move", "ca\u202en", "can\u2
 
 @pytest.mark.parametrize("name", UNREADABLE)
 def test_names_of_objects_are_one_line_that_everybody_reads_the_same(run, name: str) -> None:
-    with pytest.raises(RequestError, match="name: a name is one line of 1 to 100 characters that show") as refused:
+    with pytest.raises(RequestError, match="name: a name is one line of 1 to 100 visible characters") as refused:
         run.call(ADD, {"name": name, "object": {"shape": "plane"}})
     assert str(refused.value).isprintable()
     assert name not in {each.name for each in run.call(SHAPES)}
@@ -446,7 +446,7 @@ def test_names_in_the_yaml_and_of_scenes_keep_to_the_same_rule(section: str, nam
     thing = {"objects": {"shape": "plane"}, "clouds": {"topic": "/depth"}}[section]
     made = single_options(WorldOptions, (), "world", text=json.dumps({section: {name: thing}}))
     faults = {each.option: each.message for each in made.check(make_robot(tmp_path), ())}
-    assert "a name is one line of 1 to 100 characters that show" in faults[section, name]
+    assert "a name is one line of 1 to 100 visible characters" in faults[section, name]
     scene = SceneObject(name, "plane", (), Pose())
     with pytest.raises(PlanningError, match="an object needs a name: a name is one line"):
         first_world(WorldOptions(), [scene])

@@ -113,7 +113,7 @@ def _required(package: Distribution) -> list[str]:
 
 
 def _weight(module: str, required: Sequence[str]) -> Check:
-    """What discovery imports because of it."""
+    """Check which heavy packages discovery imports because of `module`, beyond those of `required`."""
     before = "".join(f"import {each}\n" for each in required)
     listed = f"[name for name in {HEAVY!r} if name in sys.modules and name not in before]"
     code = f"import json, sys\n{before}before = set(sys.modules)\nimport {module}\nprint(json.dumps({listed}))"
@@ -153,11 +153,9 @@ def _described(name: str, descriptor: Descriptor[Any]) -> Iterator[Check]:
 
 
 def _remedy(error: Exception, own: str) -> str:
-    """What an author does about a place in the module `own` that cannot be imported."""
+    """What to do about a place in the module `own` that cannot be imported."""
     lacking = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else own
-    return (
-        "name what is there" if lacking == own else f"add what has {lacking} to the dependencies of its pyproject.toml"
-    )
+    return "correct the name" if lacking == own else f"add the package with {lacking} to dependencies in pyproject.toml"
 
 
 def _places(make: Any) -> list[Late]:

@@ -238,7 +238,7 @@ def _parts(templates: Iterable[Any], facts: Mapping[str, Any], *names: str) -> d
 
 
 def _gap(text: str) -> str:
-    """What the formatter has between imports and a text: two empty lines only above functions and classes."""
+    """The empty lines that the formatter wants between imports and a text: two only above functions and classes."""
     return "\n" * (1 + text.startswith(("def ", "class ", "@")))
 
 

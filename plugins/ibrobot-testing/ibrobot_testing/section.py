@@ -64,7 +64,7 @@ class SectionSuite(Suite[Component]):
                     continue
                 assert name.startswith("/"), f"the service {name!r}: its name must begin with /"
                 assert service.help, f"the service {name} has no help"
-                assert isinstance(service.answer, type | UnionType), f"the service {name} says no type of its answer"
+                assert isinstance(service.answer, type | UnionType), f"the service {name} states no type of its answer"
 
     def test_steps_without_and_with_messages(self) -> None:
         """A tick of lockstep does not need messages, and takes joint states."""

@@ -81,8 +81,8 @@ def test_good_package_fails_nothing_and_says_what_was_not_run(site: Site, capsys
          "options without help: gain; ibrobot plugins show and forms show it: write help=…"),
         (':FakeTeleop")', ':Nobody")', "teleop wave",
          "ibrobot_testing.fakes.host:Nobody cannot be imported: module 'ibrobot_testing.fakes.host' has no attribute"),
-        (':FakeTeleop")', ':Nobody")', "teleop wave", "; name what is there"),
-        ("ibrobot_testing.fakes.host:", "fake_wave.none:", "teleop wave", "; name what is there"),
+        (':FakeTeleop")', ':Nobody")', "teleop wave", "; correct the name"),
+        ("ibrobot_testing.fakes.host:", "fake_wave.none:", "teleop wave", "; correct the name"),
         ("ibrobot_testing.fakes.host:FakeTeleop", "ibrobot_core.api:Teleop", "teleop wave",
          "Teleop lacks connect, disconnect, read; define these methods"),
         ('"waves"', '""', "teleop wave", "it has no summary; lists of plugins show it"),
@@ -114,7 +114,7 @@ def test_missing_dependency_of_an_implementation_is_named(site: Site) -> None:
     (site.folder / "fake_stick.py").write_text("import no_such_library.sticks\n")
     wrong = [check for check in examine("fake-wave", installed_plugins()) if check.name == "teleop wave"][-1]
     assert wrong.found == "fake_stick:FakeTeleop cannot be imported: No module named 'no_such_library'"
-    assert (wrong.ok, wrong.remedy) == (False, "add what has no_such_library to the dependencies of its pyproject.toml")
+    assert (wrong.ok, wrong.remedy) == (False, "add the package with no_such_library to dependencies in pyproject.toml")
 
 
 @pytest.mark.parametrize(

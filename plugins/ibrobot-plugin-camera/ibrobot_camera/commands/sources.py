@@ -46,7 +46,7 @@ def _open(camera: OpenCvCamera) -> None:
     try:
         camera.open()
     except SensorError as error:
-        # A device that is given by itself has no name to tell; its message begins with the device.
+        # A device given directly has no name in a YAML; the rest of the message begins with the device.
         raise SensorError(str(error).removeprefix(f"camera {_UNNAMED}: ")) from None
 
 

@@ -13,7 +13,7 @@ from ibrobot_diagnose.window import Floats, Window
 
 _SHOWN = frozenset({"demonstration", "state"})
 _SLOW = 0.003
-"""Motion from one time to the next that is none, beside the noise of readings [rad]."""
+"""Motion between two samples up to which it counts as noise [rad]."""
 _GOES_ON = 0.2
 """Share of its largest speed with which a joint goes on moving; scripted motions have at most 0.04 where they stop."""
 
@@ -118,10 +118,10 @@ class Saturated(Cause):
 
 
 def _cut_off(still: NDArray[np.bool_], others: Floats) -> NDArray[np.bool_]:
-    """Where a joint is cut off among the times at which it stands at its end, shape (T,).
+    """At which of the times in `still`, at which a joint stands at its extreme, it is cut off; both have shape (T,).
 
-    There the other joints go on moving, by `others` from each time to the next, when it stops or moves on. A joint that
-    a motion leaves where it is stops and moves on where all others do: at the ends of a part of the motion.
+    It is cut off if other joints keep moving (by `others` between two samples) while it stops or starts. In a planned
+    motion that merely ends at the extreme, all joints stop and start together.
     """
     pace = (others / np.maximum(others.max(axis=0, initial=0.0), _SLOW)).max(axis=1, initial=0.0)
     edges = np.flatnonzero(np.diff(still.astype(int), prepend=0, append=0))

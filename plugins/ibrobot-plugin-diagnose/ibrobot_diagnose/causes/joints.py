@@ -23,7 +23,7 @@ _CONSEQUENCES = frozenset({
     "unseen_start", "unseen_states", "other_speed", "statistics", "limits_low", "stands_still", "arm_not_following",
     "guard_held", "saturated", "odd_length", "odd_path", "idle_start", "idle_end",
 })  # fmt: skip
-"""Causes that an arm seems to have if its readings are not what they are taken for."""
+"""Causes that seem to apply if the readings are in a wrong unit or order."""
 
 
 def _known(window: Window) -> Floats:
@@ -136,11 +136,11 @@ class OtherUnits(CardCause):
         states, usual = _known(window), np.abs(card.state).max()
         largest = float(np.quantile(np.abs(states), 0.99))
         ratio = max(largest / usual, 0.33 * usual / max(largest, 1e-6))
-        # Of most joints: a gripper may have a unit of its own.
+        # The median over joints: a gripper may have a different unit.
         costs = {unit: float(np.median(np.diag(_costs(each, card)))) for unit, each in self._in_units(window, states)}
         best = min(costs, key=lambda unit: costs[unit])
         plain = float(np.median(np.diag(_costs(states, card))))
-        unit = best if costs[best] < 0.3 * plain else "no unit that is known"
+        unit = best if costs[best] < 0.3 * plain else "an unknown unit"
         text = (
             f"The joint positions reach {largest:.3g}, where those of the data reach {usual:.3g} rad: they are in "
             f"{unit}."
@@ -149,7 +149,7 @@ class OtherUnits(CardCause):
 
     @staticmethod
     def _in_units(window: Window, states: Floats) -> Iterator[tuple[str, Floats]]:
-        """The positions in radians if they are in a unit, and this unit."""
+        """Each unit that the positions may have, with the positions converted from it to radians."""
         yield "degrees", states * np.pi / 180
         yield "radians, the data in degrees", states * 180 / np.pi
         lower = np.array([each.lower for each in window.limits])

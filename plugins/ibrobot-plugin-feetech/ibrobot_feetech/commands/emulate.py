@@ -88,7 +88,7 @@ class Emulate:
         if self.link is not None and self.link.exists() and not self.link.is_symlink():
             raise RequestError(f"--link: {self.link} exists already and is not a link: choose another path")
         if self.link is not None and not os.access(self.link.parent, os.W_OK | os.X_OK):
-            raise RequestError(f"--link: {self.link}: you cannot write into {self.link.parent}, or it is not a folder")
+            raise RequestError(f"--link: {self.link}: {self.link.parent} is not a folder that you can write into")
         if self.cables and not self.mechanics:
             raise RequestError(
                 "--cable needs --mechanics: without it joints follow their goals, whatever is in the way"

@@ -39,8 +39,7 @@ class Finished:
 class Building:
     """Takes changes of the world in, in order, and puts what is finished into `finished`.
 
-    While the world has an object that the guard cannot check, e.g. on a link that is not there, it is not known well
-    enough.
+    While the world has an object that the guard cannot check, e.g. on an unknown link, the world counts as too old.
 
     Args:
         arm: the arm.
@@ -75,7 +74,7 @@ class Building:
         self.changes = self.refused = 0
         """Number of changes, and of objects that could not be checked."""
         self._unusable: dict[str, str] = {}
-        """Those that the world has now, and why."""
+        """Objects of the present world that cannot be checked -> why."""
 
     def add(self, change: WorldChange) -> None:
         """Have a change taken in."""
@@ -150,5 +149,5 @@ class Building:
         """The oldest world that is finished and not taken over yet."""
         try:
             return self.finished.popleft()
-        except IndexError:  # without a look before: a world that takes the place of those that wait removes them
+        except IndexError:  # not checked before: a world that replaces the waiting ones may empty the queue meanwhile
             return None

@@ -68,7 +68,7 @@ class ClearanceGuard(Guard):
             links = ", ".join(self._arm.only_visible)
             context.log.info("the guard takes hulls of visible meshes for links without collision geometry: %s", links)
         if self._arm.unmoved:
-            message = "the guard takes joints that the robot does not have to stay at their reference position: %s"
+            message = "the guard keeps joints of the model that the robot lacks at their reference position: %s"
             context.log.warning(message, ", ".join(self._arm.unmoved))
         period_s = seconds(context.period_ns)
         self._period_s = period_s

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 BASE = "base"
 """The name of a base in messages."""
 LEAST_M = 0.001
-"""Least margin [m]: between two configurations that were measured, a pair comes up to 0.9 mm nearer than its margin."""
+"""Minimum margin [m]: a pair can come 0.9 mm nearer than its margin between two configurations that were measured."""
 _LARGEST_BASE_M = 10.0
 _THINNEST_M = 1e-3
 """Coal ends the process when it makes the hull of a body whose thickness is lost in rounding."""
@@ -49,7 +49,7 @@ class BaseOptions:
     )
     bottom: float = option(0.0, unit="m", ge=-10, le=10, help="height at which it begins, in the frame of the world")
     top: float = option(0.5, unit="m", ge=-10, le=10, help="height at which it ends")
-    margin: float = option(0.05, unit="m", ge=LEAST_M, le=1, help="least distance from objects")
+    margin: float = option(0.05, unit="m", ge=LEAST_M, le=1, help="minimum distance from objects")
     x: str = option("x", help="joint that drives ahead; a base may lack one of the three")
     y: str = option("y", help="joint that drives to the left")
     theta: str = option("theta", help="joint that turns, counterclockwise")
@@ -82,10 +82,8 @@ class RegionOptions:
 class ClearanceGuardOptions(Options):
     """The guard `clearance`: stops in front of the arm itself and of the objects of the section `world`."""
 
-    margin: float = option(0.003, unit="m", ge=LEAST_M, le=0.2, help="least distance of the arm from objects")
-    self_margin: float = option(
-        LEAST_M, unit="m", ge=LEAST_M, le=0.2, help="least distance of the arm's links from one another"
-    )
+    margin: float = option(0.003, unit="m", ge=LEAST_M, le=0.2, help="minimum distance of the arm from objects")
+    self_margin: float = option(LEAST_M, unit="m", ge=LEAST_M, le=0.2, help="minimum distance between the arm's links")
     floor: float | None = option(
         None, unit="m", help="height of the table's top in the base frame; none: that of robot.description, if any"
     )

@@ -65,7 +65,7 @@ class Pairs:
             pause()
         self._data = arm.model.createData()
         self._turning = np.abs(arm.effects).sum(axis=0)
-        """How far all that turns with each joint turns together, at most [rad/rad], shape (J,)."""
+        """Sum of the motions of all joints that move with each joint, at most [rad/rad], shape (J,)."""
         self.names: Sequence[Pair] = [names for part in self.parts for names in part.names]
         sizes = [len(part.names) for part in self.parts]
         begins = np.cumsum([0, *sizes])

@@ -46,7 +46,7 @@ class Moving:
     still: Sequence[LinkShape]
     """The others, e.g. of the base."""
     levers: Vector
-    """As of `_levers`, shape (S, N)."""
+    """The result of `_levers`, shape (S, N)."""
     coarse: Moving | None = None
     """With one hull in place of the shapes of each link, for clouds, whose many blocks are coarse themselves."""
 
@@ -238,7 +238,7 @@ def _has_sphere(shape: LinkShape) -> bool:
 
 
 def _levers(arm: Arm, shapes: Sequence[LinkShape]) -> Vector:
-    """Largest distance of any point of each shape from each joint's axis [m]; 1 for slides, 0 if it moves it not.
+    """Largest distance of any point of each shape from each joint's axis [m]; 1 for slides, 0 if it does not move.
 
     Of Pinocchio's joints, shape (S, N). Upper bounds for all configurations, from bounding spheres on a stretched-out
     arm.

@@ -56,11 +56,11 @@ class Permissions:
         return World(objects)
 
     def _permitted(self, name: str, own: str, thing: WorldObject) -> Iterator[tuple[str, WorldObject]]:
-        """An object with what may touch it; the cells that lie in the same regions are an object of their own.
+        """An object with what may touch it; the cells in the same regions become a separate object.
 
         Args:
             name: its name in the world.
-            own: its name in the guard, unless it is divided.
+            own: its name in the guard, unless its cells are divided.
             thing: the object.
         """
         free = self._options.free
@@ -89,7 +89,7 @@ class Permissions:
 
 
 def _new_name(name: str, taken: Collection[str]) -> str:
-    """A name that no object has, since one would take the place of the other."""
+    """A name that no object has: of two objects with one name, one would replace the other."""
     while name in taken:
         name += "'"
     return name

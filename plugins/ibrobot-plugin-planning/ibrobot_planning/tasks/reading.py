@@ -113,5 +113,5 @@ def _texts(value: Any, key: tuple[str | int, ...]) -> Iterator[tuple[tuple[str |
 
 
 def _is_shown(character: str) -> bool:
-    """Whether a text may have a character, as in requests: a YAML can escape any."""
+    """Whether a text may contain a character, by the rule of requests; YAML escapes can write any."""
     return character in "\t\n" or category(character) not in ("Cc", "Cs")

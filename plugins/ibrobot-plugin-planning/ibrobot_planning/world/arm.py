@@ -102,7 +102,7 @@ class Arm:
         return self.followed(converted)
 
     def followed(self, native: Vector, *, motion: bool = False) -> Vector:
-        """The same array, shape (..., N), with where the followers are; with their motion by that of the others."""
+        """Fill in the followers' positions, or displacements if `motion`, in the array, shape (..., N); returns it."""
         each = self.followers
         if len(each.columns):
             followed = each.factors * native[..., self.columns[each.leaders]]
@@ -181,7 +181,7 @@ class Arm:
         return [(i, j) for (i, a), (j, b) in combinations(enumerate(self.shapes), 2) if a.joint != b.joint]
 
     def adjacent(self) -> set[Pair]:
-        """Links that one joint connects, or moves beside one another, as the two fingers of a gripper."""
+        """Links that one joint connects, or moves side by side, e.g. the two fingers of a gripper."""
         connected, parents = set(), self.model.parents
         moving = [(), *(tuple(np.flatnonzero(row)) for row in self.effects)]
         for i, j in self.pairs():

@@ -1,4 +1,4 @@
-"""The greatest numbers that are no mistakes."""
+"""Largest plausible numbers."""
 
 FURTHEST = 1000.0
 """Positions [m] and angles [rad] beyond this are refused as mistakes; distances to them are not computed well."""

@@ -287,7 +287,7 @@ class Touched:
     """A request to `/world/touch`, in place of the previous one."""
 
     objects: tuple[str, ...] = option(
-        (), help="objects that the hand, and what it carries, may touch; `floor`: what it carries, that of a planner"
+        (), help="objects that the hand and its load may touch; `floor` lets the load touch the planner's floor"
     )
 
 

@@ -223,7 +223,7 @@ function homeOf() {
 
 function toHome() {
   const origin = homeOf();
-  return origin ? [h("a", { class: "button", href: `${origin}/#jobs` }, "See what became of it")] : [];
+  return origin ? [h("a", { class: "button", href: `${origin}/#jobs` }, "See its result")] : [];
 }
 
 function showConnection() {

@@ -33,8 +33,8 @@ export function refresh(element, description, make) {
 const CONTROLS = "a, button, input, select, textarea, summary, [tabindex='0']";
 const nameOf = (control) => `${control.localName} ${control.getAttribute("aria-label") ?? (control.id || control.textContent)}`;
 
-// Replaces an element's children. If one of them had the focus, that of the same name gets it, or else the element: a key
-// that is pressed twice does not press another button.
+// Replaces an element's children. If one of them had the focus, the new child of the same name gets it, or else the
+// element, so that a second key press does not activate another button.
 export function replace(element, ...children) {
   const before = document.activeElement;
   const name = before !== element && element.contains(before) ? nameOf(before) : null;
@@ -63,7 +63,7 @@ export function row(cells, properties = {}) {
   }));
 }
 
-// Gives the focus to an element, unless something else has it: a browser drops it from what is disabled or replaced.
+// Gives an element the focus, unless another one has it: browsers drop the focus of elements that are disabled or replaced.
 export function regain(element) { if (document.activeElement === document.body || !document.activeElement) element.focus({ preventScroll: true }); }
 
 // A part that scrolls, by keys too.

@@ -61,8 +61,8 @@ export function looking(from, to) {
   return { matrix, right, up, ahead };
 }
 
-// Where to look, and from how far, so that all points are in sight: as given if they are.
-// `half`: half the height of what is seen at a distance of 1.
+// Target and distance of the camera from which all points are visible; unchanged if they already are.
+// `half`: half the visible height at distance 1.
 export function framed(points, target, distance, half) {
   const reach = (from) => 1.2 * Math.max(...points.map((point) => length(subtract(point, from))));
   if (!points.length || reach(target) <= distance * half) return { target, distance };

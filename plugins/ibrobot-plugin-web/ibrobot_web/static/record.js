@@ -4,7 +4,7 @@ import { Cues } from "./cues.js";
 import { h, refresh, say } from "./dom.js";
 
 const GIB = 1 << 30;
-const TWICE_MS = 600; // a key or button that is pressed twice, until what the first one changed has come back
+const TWICE_MS = 600; // how long a second press of a key or button is ignored, until the first one's effect is visible
 
 export class Record {
   constructor(section, page) {
@@ -72,7 +72,7 @@ export class Record {
     return [form, ...again("Redo the last"), this.cues.choice];
   }
 
-  // Does what the button with a key does, unless it was just done.
+  // Runs the action of a button's key, unless it has just run.
   once(key, act) {
     const now = performance.now();
     if (key === this.pressed?.key && now - this.pressed.at < TWICE_MS) return;

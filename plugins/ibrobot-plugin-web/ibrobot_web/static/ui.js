@@ -41,7 +41,7 @@ class Ui extends EventTarget {
     }
   }
 
-  // Whether a run starts: it has no page yet. Another one begun meanwhile would be that of a button pressed twice.
+  // Whether a run is starting and has no page yet: another start meanwhile would come from a button pressed twice.
   get startsRun() {
     const started = [...this.jobs.values()].some(({ kind, state, facts }) => RUNS.includes(kind) && state === "running" && !facts.url);
     return started || (this.begun !== undefined && !this.jobs.has(this.begun));

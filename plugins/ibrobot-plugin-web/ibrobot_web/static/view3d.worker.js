@@ -23,7 +23,7 @@ let measured = null, commanded = null, planned = null;
 let trail = [], path, future, grid, ball;
 let dirty = true, stamp = 0, drawn = 0, size = [1, 1], jogs = false, view = null;
 let cameras = [];
-let fresh = false; // a model that no state has posed yet: its file's extent is that of joints at 0
+let fresh = false; // a new model before its first state: the extent in its file is for joints at 0
 let near = []; // names of bodies and objects that the guard keeps apart
 const shapes = new Map(); // of objects, by type and size
 let goals = false, goal = null, kept = false, begun = 0;

@@ -1,4 +1,4 @@
-"""An arm with two cameras, and a leader, that exist only on paper: LeRobot's own commands record and move them.
+"""A made-up arm with two cameras, and a leader: LeRobot's own commands record and move them.
 
 LeRobot has no simulated SO-101. This one has its joints, and pictures of the size of the dataset to compare with.
 """
@@ -32,7 +32,7 @@ class MadeUpRobotConfig(RobotConfig):  # type: ignore[misc]  # LeRobot has no ty
 
 
 class MadeUpRobot(Robot):  # type: ignore[misc]
-    """An arm that goes where it is told at once."""
+    """An arm that reaches its goals at once."""
 
     config_class = MadeUpRobotConfig
     name = "made_up"

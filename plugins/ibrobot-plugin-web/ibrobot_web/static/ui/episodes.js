@@ -120,7 +120,7 @@ export class View {
   }
 
   async open(path) {
-    if (path !== this.path) this.controls.replaceChildren(); // they act on the former one
+    if (path !== this.path) this.controls.replaceChildren(); // they act on the previous one
     this.path = path;
     this.draw();
     this.detail.hidden = !path;

@@ -104,7 +104,7 @@ export class JobCard {
 // Why a job failed: its own error, or else its error lines, or its last lines.
 function failure(job) {
   if (job.facts.error) return [problem(job.facts.error)];
-  if (job.exit_code < 0) return [problem(`Something ended it from outside, by signal ${-job.exit_code}. Its output has its last lines.`)];
+  if (job.exit_code < 0) return [problem(`It was killed by signal ${-job.exit_code}. Its last lines are in its output.`)];
   const errors = job.lines.filter((line) => line.startsWith("error: "));
   const text = errors.length ? errors.map((line) => line.slice("error: ".length)) : job.lines.slice(-8);
   return [problem([`exit code ${job.exit_code}`, ...text].join("\n"))];
@@ -123,7 +123,7 @@ export class JobList {
   // Shows all jobs of the kinds.
   show() { for (const job of this.ui.jobs.values()) this.update(job); }
 
-  // Brings a job that was begun into view, with the focus, which its button lost: what comes next follows in its card.
+  // Scrolls a job that was just started into view and gives its card the focus, which the button lost.
   reveal(started, button) {
     setTimeout(() => { // once its card is there
       const { element } = this.cards.get(started?.number) ?? {};

@@ -74,13 +74,13 @@ function record({ episodes, unjudged, newest }) {
 
 function learn({ episodes, datasets, policies }) {
   const text = `${count(datasets.length, "dataset")}, ${count(policies.length, "policy", "policies")}.`;
-  if (!datasets.length) return [text, episodes ? link("job-convert", "Convert the episodes") : note("Datasets are made of recorded episodes.")];
+  if (!datasets.length) return [text, episodes ? link("job-convert", "Convert the episodes") : note("Datasets are made from recorded episodes.")];
   return [text, policies.length ? link("policies", "Use a policy in a robot") : link("job-train", "Train a policy")];
 }
 
 function evaluate({ policies, reports }) {
   const text = reports ? `${count(reports, "evaluation")}.` : "No evaluation yet.";
-  return [text, reports ? link("report-evaluation", "See the results") : policies.length ? link("job-eval", "Evaluate a policy") : note("What is evaluated is a trained policy.")];
+  return [text, reports ? link("report-evaluation", "See the results") : policies.length ? link("job-eval", "Evaluate a policy") : note("An evaluation needs a trained policy.")];
 }
 
 const note = (text) => h("p", { class: "note" }, text);
