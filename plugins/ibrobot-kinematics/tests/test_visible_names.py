@@ -25,7 +25,7 @@ def test_names_of_one_line_are_names(name: str) -> None:
 )  # fmt: skip
 def test_what_does_not_show_is_no_name_and_the_error_shows_it(text: str) -> None:
     fault = name_fault(text)
-    assert fault.startswith("a name is one line of 1 to 100 characters that show, without spaces around it, got '")
+    assert fault.startswith("a name is one line of 1 to 100 visible characters, without spaces around it, got '")
     assert fault.isascii()
     assert fault.isprintable()
     assert len(fault) < 1200
