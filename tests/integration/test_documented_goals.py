@@ -179,7 +179,7 @@ def test_every_entrance_plans_the_same(run: Runtime, goal: str) -> None:
         assert by_task(run, goal) == answer
     reached = by_ros(goal)
     assert (reached is None) == isinstance(answer, str)
-    if reached is not None:
+    if reached is not None and not isinstance(answer, str):
         np.testing.assert_allclose(reached, answer[0], atol=2e-3)
     for other in (by_page(run, goal), by_command(goal)):
         if isinstance(answer, str) or isinstance(other, str):

@@ -12,8 +12,8 @@ import numpy as np
 
 from ibrobot_core.api import HardwareError, Pose, Quaternion, Vector3
 from ibrobot_planning.guard.meshes import is_large
+from ibrobot_planning.world.bounds import FURTHEST
 from ibrobot_planning.world.objects import SIMPLE, Boxes, Mesh, Shape, Voxels, World, WorldObject
-from ibrobot_planning.world.options import FURTHEST
 
 _NAMES: Mapping[type[Any], str] = {kind: name for name, kind in SIMPLE.items()}
 _CELLS, _FEWER_CELLS = ("<i2", "<i8"), 2**15
