@@ -123,9 +123,6 @@ class Client:
     """Stops, likewise."""
 
 
-logging.getLogger("mcp").setLevel(logging.ERROR)  # it warns of what agents send: a flood would hide the run's own lines
-
-
 class AgentServer:
     """Answers agents.
 
@@ -137,6 +134,8 @@ class AgentServer:
     """
 
     def __init__(self, run: RunView) -> None:
+        # The SDK warns of what agents send: a flood would hide the run's own lines.
+        logging.getLogger("mcp").setLevel(logging.ERROR)
         self._run = run
         self._authority = authority_of(run)
         self._tools = Tools(run)

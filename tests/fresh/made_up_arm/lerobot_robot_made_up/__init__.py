@@ -25,13 +25,37 @@ def positions(step: int) -> dict[str, float]:
     return {name: float(np.sin(step / 30 + i)) for i, name in enumerate(JOINTS)}
 
 
+class MadeUpDevice:
+    """What needs no cable and no calibration."""
+
+    _connected = False
+
+    @property
+    def is_connected(self) -> bool:
+        return self._connected
+
+    @property
+    def is_calibrated(self) -> bool:
+        return True
+
+    def connect(self, calibrate: bool = True) -> None:
+        self._connected = True
+
+    def calibrate(self) -> None: ...
+
+    def configure(self) -> None: ...
+
+    def disconnect(self) -> None:
+        self._connected = False
+
+
 @RobotConfig.register_subclass("made_up")
 @dataclass
 class MadeUpRobotConfig(RobotConfig):  # type: ignore[misc]  # LeRobot has no types
     """It has nothing to set."""
 
 
-class MadeUpRobot(Robot):  # type: ignore[misc]
+class MadeUpRobot(MadeUpDevice, Robot):  # type: ignore[misc]
     """An arm that reaches its goals at once."""
 
     config_class = MadeUpRobotConfig
@@ -40,7 +64,6 @@ class MadeUpRobot(Robot):  # type: ignore[misc]
     def __init__(self, config: MadeUpRobotConfig) -> None:
         super().__init__(config)
         self.cameras = dict.fromkeys(CAMERAS)
-        self._connected = False
         self._step = 0
         rows, columns = np.mgrid[:HEIGHT, :WIDTH]
         shifts = range(60)
@@ -56,21 +79,6 @@ class MadeUpRobot(Robot):  # type: ignore[misc]
     def action_features(self) -> dict[str, Any]:
         return dict.fromkeys(JOINTS, float)
 
-    @property
-    def is_connected(self) -> bool:
-        return self._connected
-
-    @property
-    def is_calibrated(self) -> bool:
-        return True
-
-    def connect(self, calibrate: bool = True) -> None:
-        self._connected = True
-
-    def calibrate(self) -> None: ...
-
-    def configure(self) -> None: ...
-
     def get_observation(self) -> dict[str, Any]:
         self._step += 1
         shown = {name: self._pictures[(self._step + 20 * i) % 60].copy() for i, name in enumerate(CAMERAS)}
@@ -79,9 +87,6 @@ class MadeUpRobot(Robot):  # type: ignore[misc]
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         return action
 
-    def disconnect(self) -> None:
-        self._connected = False
-
 
 @TeleoperatorConfig.register_subclass("made_up_leader")
 @dataclass
@@ -89,7 +94,7 @@ class MadeUpLeaderConfig(TeleoperatorConfig):  # type: ignore[misc]
     """It has nothing to set."""
 
 
-class MadeUpLeader(Teleoperator):  # type: ignore[misc]
+class MadeUpLeader(MadeUpDevice, Teleoperator):  # type: ignore[misc]
     """A leader that is always in motion."""
 
     config_class = MadeUpLeaderConfig
@@ -97,7 +102,6 @@ class MadeUpLeader(Teleoperator):  # type: ignore[misc]
 
     def __init__(self, config: MadeUpLeaderConfig) -> None:
         super().__init__(config)
-        self._connected = False
         self._step = 0
 
     @property
@@ -108,26 +112,8 @@ class MadeUpLeader(Teleoperator):  # type: ignore[misc]
     def feedback_features(self) -> dict[str, Any]:
         return {}
 
-    @property
-    def is_connected(self) -> bool:
-        return self._connected
-
-    @property
-    def is_calibrated(self) -> bool:
-        return True
-
-    def connect(self, calibrate: bool = True) -> None:
-        self._connected = True
-
-    def calibrate(self) -> None: ...
-
-    def configure(self) -> None: ...
-
     def get_action(self) -> dict[str, float]:
         self._step += 1
         return positions(self._step)
 
     def send_feedback(self, feedback: dict[str, Any]) -> None: ...
-
-    def disconnect(self) -> None:
-        self._connected = False
