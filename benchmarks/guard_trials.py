@@ -210,6 +210,22 @@ class Judge:
         forbidden = away[required > 0]
         return float(forbidden.min(initial=self._seen)), float((away - required).min(initial=self._seen))
 
+    def leads_in(self, first: Vector, begin: Vector, end: Vector) -> bool:
+        """Whether a way leads a pair that is too near a millimetre nearer than at a first configuration.
+
+        By `distance`, since contacts may say a depth that is a millimetre or two off.
+        """
+        before = min(self._beyond(first), 0.0)
+        return any(self._beyond(begin + share * (end - begin)) < before - 0.001 for share in (0.25, 0.5, 0.75, 1.0))
+
+    def _beyond(self, q: Vector) -> float:
+        """As the second of `room`, by `distance`."""
+        _, required, geoms = self.look(q)
+        pairs = {
+            frozenset(self._names[geom] for geom in pair): least for pair, least in zip(geoms, required, strict=True)
+        }
+        return min((self.distance(q, set(names)) - least for names, least in pairs.items()), default=self._seen)
+
     def along(self, begin: Vector, end: Vector) -> tuple[float, float]:
         """As `room`, the least on the straight way between two commands."""
         rooms = [self.room(end)]
@@ -544,7 +560,8 @@ def appears(station: Station, judge: Judge, seed: int) -> str:
     """
     rng = np.random.default_rng(seed)
     loop, goal, name = _moving(station, judge, rng)
-    could = min(judge.room(q)[1] for q in loop.way)
+    stops = loop.safety.rest - loop.position
+    could = min(judge.room(loop.position + share * stops)[1] for share in np.linspace(0, 1, 100))
     loop.world(WorldChange(judge.objects))
     said, label = False, ""
     for tick in range(150):
@@ -621,7 +638,7 @@ def backs_out(station: Station, judge: Judge, seed: int, *, guarded: bool = True
         for _ in range(12):
             before = loop.position
             now = judge.along(before, loop.tick(ways[best]))[1]
-            if guarded and now < min(room, 0.0) - 0.001:
+            if guarded and now < min(room, 0.0) - 0.001 and judge.leads_in(begin, before, loop.position):
                 return f"seed {seed}: from {1e3 * room:.2f} to {1e3 * now:.2f} mm, further in"
             if np.array_equal(loop.position, before):
                 break
