@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from ibrobot_core.api import SensorError
 from ibrobot_mujoco import gl
 
-# EGL's display is global and initialised with the first context, which two threads must not create at once.
-_creating = threading.Lock()
+_drawing = threading.Lock()
+"""Held while a context is made, drawn in, read or freed. All contexts of the process share EGL's display, and so the
+screen of the driver: Mesa 22.3's software renderer crashed once while two cameras drew at the same time."""
 
 
 class Renderer:
@@ -28,13 +29,14 @@ class Renderer:
     """
 
     def __init__(self, model: mujoco.MjModel, camera: int, width: int, height: int, *, shadows: bool) -> None:
-        self.backend = gl.choose()
         self._model = model
         model.vis.global_.offwidth = width
         model.vis.global_.offheight = height
-        self._context = _make_context(self.backend, width, height)
-        self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._mjr)
+        with _drawing:
+            self.backend = gl.choose()
+            self._context = _make_context(self.backend, width, height)
+            self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._mjr)
         self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 100)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         self._option = mujoco.MjvOption()
@@ -45,9 +47,8 @@ class Renderer:
 
     def render(self, drawn: mujoco.MjData) -> NDArray[np.uint8]:
         """The camera's image of `drawn`, shape (height, width, 3), RGB, top row first."""
-        self._draw(drawn)
         pixels = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
-        mujoco.mjr_readPixels(pixels, None, self._rect, self._mjr)
+        self._draw(drawn, pixels, None)
         return np.ascontiguousarray(pixels[::-1])
 
     def render_depth(self, drawn: mujoco.MjData) -> NDArray[np.float32]:
@@ -55,10 +56,9 @@ class Renderer:
 
         The background is at the far clipping plane.
         """
-        self._draw(drawn)
-        self._mjr.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         buffer = np.empty((self._rect.height, self._rect.width), np.float32)
-        mujoco.mjr_readPixels(None, buffer, self._rect, self._mjr)
+        self._mjr.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+        self._draw(drawn, None, buffer)
         # The buffer is n (f - z) / (z (f - n)) for clipping planes at n and f.
         extent, planes = self._model.stat.extent, self._model.vis.map
         near, far = planes.znear * extent, planes.zfar * extent
@@ -81,26 +81,29 @@ class Renderer:
         result: NDArray[np.int32] = geom_of[np.clip(numbers, 0, self._scene.ngeom)]
         return result
 
-    def _draw(self, drawn: mujoco.MjData) -> None:
-        self._context.make_current()
+    def _draw(self, drawn: mujoco.MjData, pixels: NDArray[np.uint8] | None, depths: NDArray[np.float32] | None) -> None:
+        """Draw, and read the bottom row first into `pixels`, shape (height, width, 3), or `depths`, (height, width)."""
         everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self._model, drawn, self._option, None, self._view, everything, self._scene)
-        mujoco.mjr_render(self._rect, self._scene, self._mjr)
+        with _drawing:
+            self._context.make_current()
+            mujoco.mjr_render(self._rect, self._scene, self._mjr)
+            mujoco.mjr_readPixels(pixels, depths, self._rect, self._mjr)
 
     def close(self) -> None:
         """Release the context. Safe to call twice."""
-        if self._context is not None:
-            self._context.make_current()
-            self._mjr.free()
-            self._context.free()
-            self._context = None
+        with _drawing:
+            if self._context is not None:
+                self._context.make_current()
+                self._mjr.free()
+                self._context.free()
+                self._context = None
 
 
 def _make_context(backend: str, width: int, height: int) -> Any:
-    with _creating:
-        try:
-            context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
-            context.make_current()
-        except Exception as error:
-            raise SensorError(f"OpenGL backend {backend} makes no context here: {error}") from error
+    try:
+        context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
+        context.make_current()
+    except Exception as error:
+        raise SensorError(f"OpenGL backend {backend} makes no context here: {error}") from error
     return context

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from importlib import import_module
 from types import SimpleNamespace
 from typing import Any, cast, override
 
 import attrs
+import mujoco
 import numpy as np
 import pytest
 from ibrobot_kinematics.poses import matrix
+from ibrobot_mujoco import gl
 from ibrobot_mujoco.camera import MujocoCamera
 from ibrobot_mujoco.hardware import MujocoHardware
 from ibrobot_mujoco.model import build_spec
@@ -340,6 +343,47 @@ def test_low_poly_looks_like_the_full_meshes(ctx: Context) -> None:
     overlap = (yellow[0] & yellow[1]).sum() / (yellow[0] | yellow[1]).sum()
     assert overlap > 0.9
     assert np.abs(low_poly - expected).mean() < 4
+
+
+def drawn_and_closed(frames: list[Any]) -> None:
+    """Make, use and close a renderer, and append what it drew."""
+    drawn = DrawnWorld.of(OPTIONS, ROBOT)
+    renderer = Renderer(drawn.model, drawn.model.camera("top").id, 64, 48, shadows=False)
+    try:
+        drawn.follow(STATE)
+        frames.append(renderer.render(drawn.data))
+    finally:
+        renderer.close()
+
+
+@pytest.mark.parametrize("step", ["making", "reading", "freeing"])
+def test_renderers_of_two_threads_never_use_opengl_at_once(step: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames, overlaps, entered = [], [], threading.Event()
+    other = threading.Thread(target=drawn_and_closed, args=(frames,))
+    context = import_module(f"mujoco.{gl.choose()}").GLContext
+    steps: tuple[tuple[str, Any, str], ...] = (
+        ("making", mujoco, "MjrContext"),
+        ("reading", mujoco, "mjr_readPixels"),
+        ("freeing", context, "free"),
+    )
+
+    def watch(name: str, original: Any) -> Any:
+        def watched(*arguments: Any) -> Any:
+            if threading.current_thread() is other:
+                entered.set()
+            elif name == step and other.ident is None:
+                other.start()
+                overlaps.append(entered.wait(0.5))
+            return original(*arguments)
+
+        return watched
+
+    for name, owner, attribute in steps:
+        monkeypatch.setattr(owner, attribute, watch(name, getattr(owner, attribute)))
+    drawn_and_closed(frames)
+    other.join()
+    assert overlaps == [False]
+    assert np.array_equal(*frames)
 
 
 def test_depth_is_the_distance_along_the_optical_axis() -> None:
