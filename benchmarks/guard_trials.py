@@ -316,9 +316,11 @@ class ControlLoop:
 
     def beyond(self) -> float:
         """How far the joints have moved points of the arm off the path, beyond what the margin held, at most [m]."""
-        gaps = np.abs(np.array(self.commands) - self.measured)
-        nearest = int((gaps @ self._reach).argmin())
-        return float(self._reach @ np.maximum(gaps[nearest] - self._held[nearest], 0.0))
+        commands, held = np.array(self.commands), np.array(self._held)
+        shares = np.linspace(0, 1, 11)[:, None, None]
+        gaps = np.abs(commands[:-1] + shares * np.diff(commands, axis=0) - self.measured)
+        share, nearest = np.unravel_index((gaps @ self._reach).argmin(), gaps.shape[:2])
+        return float(self._reach @ np.maximum(gaps[share, nearest] - held[nearest : nearest + 2].max(axis=0), 0.0))
 
     def close(self) -> None:
         """Stop the robot."""

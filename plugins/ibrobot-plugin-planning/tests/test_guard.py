@@ -39,7 +39,7 @@ from ibrobot_planning.world.objects import (
     WorldObject,
 )
 
-from ibrobot_core.api import Clock, Context, HardwareError, Pose, RealClock, Robot, SteppedClock, Vector, Vector3
+from ibrobot_core.api import Clock, Context, HardwareError, Pose, RealClock, Robot, SteppedClock, Vector, Vector3, ns
 from ibrobot_core.app import Bus
 from ibrobot_core.control.safety import SafetyLayer
 
@@ -62,17 +62,18 @@ class Loop:
         guarded: bool = True,
         clock: Clock | None = None,
         described: dict[str, Any] | None = None,
+        period_ns: int = PERIOD_NS,
         **options: Any,
     ) -> None:
         robot: Robot = make_robot(folder)
         self.robot = attrs.evolve(robot, description=attrs.evolve(robot.description, **(described or {})))
         context = Context(
-            "guard", clock or SteppedClock(7), logging.getLogger("test"), self.robot, self.robot.joint_names
+            "guard", clock or SteppedClock(7), logging.getLogger("test"), self.robot, self.robot.joint_names, period_ns
         )
         self.guard = ClearanceGuard(
             ClearanceGuardOptions(**{"margin": MARGIN_M, "self_margin": MARGIN_M, **options}), context
         )
-        self.safety = SafetyLayer(self.robot, PERIOD_NS, self.guard if guarded else None)
+        self.safety = SafetyLayer(self.robot, period_ns, self.guard if guarded else None)
         self.position = np.zeros(len(JOINTS)) if at is None else at
         self.safety.activate(self.position)
 
@@ -484,6 +485,31 @@ def test_joints_that_stray_from_their_path_widen_the_margin(tmp_path) -> None:
         said = json.loads(loop.guard.overruled)["text"]
         assert ("pan was 0.05 rad from its commands" in said) == (offset > 0)
     assert at["offset"] > at["none"] + 0.02
+
+
+@pytest.mark.parametrize("rate_hz", [20, 50, 100, 500])
+def test_joints_that_lag_are_on_their_path_between_two_commands_too(tmp_path, rate_hz: int) -> None:
+    """At 20 Hz and 3 rad/s, two commands are 0.15 rad apart: a servo in between has not strayed."""
+    loop = Loop(tmp_path, period_ns=ns(1 / rate_hz))
+    wanted, before = np.array([1.5, 0.6, 0.0, 0.0, 0.0, 0.0]), loop.position
+    strays, fastest = [], 0.0
+    for share in np.random.default_rng(rate_hz).random(rate_hz // 2).tolist():
+        at = loop.position
+        loop.tick(wanted, before + share * (at - before))
+        fastest, before = max(fastest, float(np.abs(at - before).max()) * rate_hz), at
+        strays.append(loop.guard.strays)
+    assert fastest == pytest.approx(loop.robot.max_velocity[0], rel=0.01)
+    assert np.max(strays) < 1e-9
+
+
+def test_the_way_between_the_newest_command_and_the_oldest_is_none_of_the_path(tmp_path) -> None:
+    """An arm that has turned by 1.5 rad on a bow is not on its path where the bow's ends are joined."""
+    loop = Loop(tmp_path)
+    for turn in np.linspace(0, np.pi, 45).tolist():
+        loop.tick(np.array([0.5 - 0.5 * math.cos(turn), 0.5 * math.sin(turn), 0.0, 0.0, 0.0, 0.0]))
+    here = loop.position
+    loop.tick(here, here / 2)
+    assert loop.guard.strays.max() > 0.1
 
 
 def test_a_joint_that_strays_widens_no_margin_of_what_it_does_not_lead_nearer(tmp_path) -> None:

@@ -88,8 +88,7 @@ class ClearanceGuard(Guard):
         """What the last setpoint was about to touch."""
         size = len(columns)
         self._past: Vector = np.full((max(2, round(_HISTORY_S / period_s)), size), np.nan)
-        """The last commands [rad], shape (H, J)."""
-        self._newest = -1
+        """The last commands, the newest one last [rad], shape (H, J)."""
         self._away: Vector = np.zeros(size)
         """Largest distance of each joint from the path of its commands, fading [rad], shape (J,)."""
         self._fade = float(np.exp(-period_s / _DECAY_S))
@@ -226,15 +225,18 @@ class ClearanceGuard(Guard):
 
     def _note(self, position: Vector, measured: Vector) -> None:
         """Take in the last command and where the joints are."""
-        if self._newest < 0:
-            self._past[:] = position
-        self._newest = (self._newest + 1) % len(self._past)
-        self._past[self._newest] = position
+        past, weights = self._past, self._reach**2
+        past[:-1] = past[1:] if np.isfinite(past[-1]).all() else position
+        past[-1] = position
         self._away *= self._fade
         known = np.isfinite(measured)
         if not known.all():
             measured = np.where(known, measured, position)
-        gaps = np.abs(self._past - measured)
+        # The nearest place on the way from each command to the next one: at a low rate, these are far apart.
+        behind, steps = measured - past[:-1], np.diff(past, axis=0)
+        lengths = (steps**2) @ weights
+        shares = ((behind * steps) @ weights) / np.where(lengths > 0, lengths, 1.0)
+        gaps = np.abs(behind - np.minimum(np.maximum(shares, 0.0), 1.0)[:, None] * steps)
         nearest = gaps[int((gaps @ self._reach).argmin())]
         self._away = np.maximum(self._away, np.where(self._follows, nearest, 0.0))
 
