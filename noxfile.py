@@ -127,9 +127,9 @@ def install(
 
 
 def lacking(session: nox.Session) -> list[dict[str, Any]]:
-    """The installed types that lack something on this machine, as `ibrobot plugins --json` lists them."""
-    listed = session.run("ibrobot", "plugins", "--json", silent=True)
-    return [row for row in json.loads(str(listed))["plugins"] if row["missing"] is not None]
+    """The installed types that lack something on this machine."""
+    rows: list[dict[str, Any]] = json.loads(str(session.run("python", "tests/house/lacking.py", silent=True)))
+    return rows
 
 
 def apt_install(session: nox.Session, *wanted: str) -> bool:
@@ -166,12 +166,11 @@ def system_libraries(session: nox.Session) -> None:
     with Path(".nox/apt.lock").open("w") as lock:  # one session at a time; the next one finds them installed
         fcntl.flock(lock, fcntl.LOCK_EX)
         found = lacking(session)
-        wanted = sorted({package for row in found for package in row["missing"]["apt"]})
+        wanted = sorted({package for row in found for package in row["apt"]})
         if wanted and apt_install(session, *wanted):
             found = lacking(session)
     for row in found:
-        missing = row["missing"]
-        note_untested(session, f"{row['kind']} {row['type']} is not tested: {missing['what']}; {missing['remedy']}")
+        note_untested(session, f"{row['kind']} {row['type']} is not tested: {row['what']}; {row['remedy']}")
 
 
 @atexit.register

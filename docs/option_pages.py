@@ -8,10 +8,10 @@ from collections.abc import Iterable, Iterator
 from typing import Any, get_args
 
 import attrs
+from ibrobot_terminal.describe import described, type_name
 from ibrobot_testing import declared_services
 
 from ibrobot_core.component_config import ComponentConfig
-from ibrobot_core.config.describe import described, type_name
 from ibrobot_core.convert import is_mapping, is_sequence
 from ibrobot_core.options import fields
 from ibrobot_core.plugins import installed_plugins

@@ -71,7 +71,6 @@ from ibrobot_core.control.spline import Spline as Spline
 from ibrobot_core.interfaces.guard import Guard as Guard
 
 # Topics and services
-from ibrobot_core.config.describe import described as described, type_name as type_name
 from ibrobot_core.bus import Bus as Bus, Subscription as Subscription, Received as Received
 from ibrobot_core.services import (
     Service as Service,
@@ -107,8 +106,7 @@ from ibrobot_core.events import (
     Failed as Failed,
     Shown as Shown,
 )
-from ibrobot_core.safe_output import echo as echo, LogFormatter as LogFormatter
-from ibrobot_core.screen import Screen as Screen, styled as styled
+from ibrobot_core.safe_output import echo as echo, printable as printable, LogFormatter as LogFormatter
 from ibrobot_core.cli.display import RunDisplay as RunDisplay, RunTerminal as RunTerminal
 from ibrobot_core.signals import on_signals as on_signals, end_signals as end_signals
 

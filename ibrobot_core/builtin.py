@@ -63,7 +63,5 @@ def ibrobot_commands() -> Iterable[Command]:
     yield Command("config", summary="Check and show robot YAMLs.", about=about)
     yield Command("config check", Late("ibrobot_core.cli.config:CheckConfig"))
     yield Command("config show", Late("ibrobot_core.cli.config:ShowConfig"))
-    yield Command("plugins", Late("ibrobot_core.cli.plugins:ListPlugins"), "List what the installed plugins offer.")
-    yield Command("plugins show", Late("ibrobot_core.cli.plugins:ShowPlugin"))
     summary = "Check this machine, and print a remedy for each fault."
     yield Command("doctor", Late("ibrobot_core.cli.doctor:Doctor"), summary)

@@ -1,7 +1,7 @@
 """Output of untrusted text to terminals and logs, without markup, control characters and secrets.
 
 Untrusted are names of peers, strings in bags and files, values in YAMLs, replies of servos and texts of exceptions. All
-output goes through `echo`, `LogFormatter`, or the `Screen` of `ibrobot_core.screen`, which call `printable`.
+output goes through `echo`, `LogFormatter`, or the `Screen` of `ibrobot_terminal.screen`, which call `printable`.
 """
 
 from __future__ import annotations

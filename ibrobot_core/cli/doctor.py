@@ -56,7 +56,7 @@ def plugin_checks(registry: Registry) -> list[Check]:
 def types(registry: Registry) -> list[Check]:
     """One failed check per dependency that installed types lack on this machine, or one check for all."""
     lacking: dict[tuple[str, str], list[str]] = {}
-    for kind, type_ in sorted(registry.entries):
+    for kind, type_ in sorted(registry.entries.keys() - registry.doubles.keys()):
         if (missing := registry.missing(kind, type_)) is not None:
             lacking.setdefault((missing.missing, missing.remedy), []).append(f"{kind} {type_}")
     checks = [Check(", ".join(names), False, *what, matters=False) for what, names in lacking.items()]

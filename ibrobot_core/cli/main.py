@@ -39,7 +39,7 @@ def _click_command(command: Command) -> click.Command:
 class Commands(click.Group):
     """The commands whose names begin with the same words; each is imported when it is called.
 
-    A command may have others below it, as `ibrobot plugins` has `ibrobot plugins show`: the first argument decides.
+    A command may have others below it, as `plugins` of ibrobot-terminal has `plugins show`: the first argument decides.
     """
 
     def __init__(self, words: str = "", **settings: Any) -> None:

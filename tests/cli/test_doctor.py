@@ -52,21 +52,6 @@ def test_what_an_installed_type_lacks_is_noted_with_its_remedy(ibrobot: Ibrobot,
     assert "sensor sound" not in ran.out
 
 
-def test_plugins_names_what_a_type_lacks(ibrobot: Ibrobot, site: Site) -> None:
-    site.add("fake-depth", "lacking_sensors.py")
-    lacking = "lacking: sensor depth: libdepth.so.1 is not there; sudo apt-get install libdepth1 libusb-1.0-0"
-
-    assert lacking in ibrobot("plugins").out.splitlines()
-    assert lacking.replace("sensor depth: ", "") in ibrobot("plugins", "show", "depth").out.splitlines()
-    rows = {row["type"]: row["missing"] for row in json.loads(ibrobot("plugins", "--json").out)["plugins"]}
-    assert rows["depth"] == {
-        "what": "libdepth.so.1 is not there",
-        "apt": ["libdepth1", "libusb-1.0-0"],
-        "remedy": "sudo apt-get install libdepth1 libusb-1.0-0",
-    }
-    assert rows["sound"] is None
-
-
 def test_as_json(ibrobot: Ibrobot, site: Site) -> None:
     site.add("fake-broken", "fails_at_import.py")
 

@@ -122,11 +122,11 @@ def piped(*arguments: str, **streams: Any) -> subprocess.CompletedProcess[str]:
 
 def test_full_output_is_an_error_of_one_line() -> None:
     with open("/dev/full", "w", encoding="utf-8") as full:
-        ran = piped("plugins", stdout=full, stderr=subprocess.PIPE)
+        ran = piped("doctor", stdout=full, stderr=subprocess.PIPE)
     assert (ran.returncode, ran.stderr) == (1, "error: standard output: No space left on device\n")
 
 
-@pytest.mark.parametrize("command", ["plugins", "--help"])
+@pytest.mark.parametrize("command", ["doctor", "--help"])
 def test_reader_that_left_is_an_error_of_one_line(command: str) -> None:
     reader, writer = os.pipe()
     os.close(reader)
@@ -137,7 +137,7 @@ def test_reader_that_left_is_an_error_of_one_line(command: str) -> None:
 
 @pytest.mark.parametrize("closed", [0, 1, 2])
 def test_closed_standard_streams_are_no_bug(closed: int) -> None:
-    command = f"{shlex.join(ibrobot_command())} plugins {closed}>&-"
+    command = f"{shlex.join(ibrobot_command())} --help {closed}>&-"
     ran = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False, timeout=60)
     assert (ran.returncode, ran.stderr) == (0, "")
 

@@ -28,7 +28,7 @@ def test_help_lists_every_command_and_those_of_plugins(ibrobot: Ibrobot, robot: 
     lines = [line.split(maxsplit=1) for line in ran.out.splitlines()]
     assert ran.code == 0
     own = [command for name, command in discover([]).commands.items() if " " not in name]
-    assert [command.name for command in own] == ["launch", "config", "plugins", "doctor"]
+    assert [command.name for command in own] == ["launch", "config", "doctor"]
     for command in own:
         assert [command.name, command.summary] in lines
     assert ["greet", "Say hello."] in lines
@@ -76,7 +76,7 @@ def test_command_of_a_missing_plugin_names_the_package(
     assert (ran.code, ran.out, ran.err) == (2, "", message)
 
 
-@pytest.mark.parametrize("command", ["config", "plugins", "doctor"])
+@pytest.mark.parametrize("command", ["config", "doctor"])
 def test_every_command_explains_itself(ibrobot: Ibrobot, command: str) -> None:
     ran = ibrobot(command, "--help")
 
@@ -98,8 +98,8 @@ def test_a_group_without_a_command_shows_its_help(ibrobot: Ibrobot, command: tup
     [
         ("la", {"launch"}),
         ("config ", {"check", "show"}),
-        ("plugins sh", {"show"}),
-        ("plugins show --", {"--json", "--help"}),
+        ("config ch", {"check"}),
+        ("config check --", {"--json", "--help"}),
         ("launch --lock", {"--lockstep"}),
         ("feed --from b", {"bowl", "bottle"}),
         ("feed --what ", {"milk", "mash"}),

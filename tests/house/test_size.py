@@ -5,7 +5,7 @@ import importlib
 import pytest
 from source_lines import ROOT, count
 
-LIMIT = 11_802
+LIMIT = 11_711
 NAMES = {"ibrobot_core.api": 140, "ibrobot_core.app": 100}
 """Floor of core's interface -> most names on it."""
 

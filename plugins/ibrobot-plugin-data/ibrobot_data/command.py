@@ -287,9 +287,8 @@ def _progress(episodes: int, quiet: bool) -> Iterator[Any]:
 
         yield line
         return
+    from ibrobot_terminal.screen import Screen, styled
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    from ibrobot_core.app import Screen, styled
 
     counts, speed = (TextColumn(each, markup=False) for each in ("{task.description}", "{task.fields[rate]}"))
     with Progress(counts, BarColumn(), speed, TimeRemainingColumn(), console=Screen(stderr=True)) as bar:

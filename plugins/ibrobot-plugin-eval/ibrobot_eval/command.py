@@ -190,10 +190,9 @@ def _lines(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
 
         yield line
         return
+    from ibrobot_terminal.screen import Screen
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
-
-    from ibrobot_core.app import Screen
 
     counts_column, successes_column = (
         TextColumn(each, markup=False) for each in ("{task.description}", "{task.fields[successes]}")

@@ -6,10 +6,11 @@ import sys
 from pathlib import Path
 
 import attrs
+from ibrobot_terminal.screen import Screen
 from rich.table import Table
 
 from ibrobot_core.api import option
-from ibrobot_core.app import Emit, Screen, echo, wrong_input
+from ibrobot_core.app import Emit, echo, wrong_input
 from ibrobot_lerobot.contents import Contents, FeatureContents
 
 

@@ -305,9 +305,8 @@ def _show(service: InferenceService, stopping: threading.Event) -> None:
         while not stopping.wait(_PLAIN_PERIOD_S):
             echo(_line(service.statistics()))
         return
+    from ibrobot_terminal.screen import Screen
     from rich.live import Live
-
-    from ibrobot_core.app import Screen
 
     with Live(console=Screen(), auto_refresh=False) as display:
         while not stopping.wait(_PANEL_PERIOD_S):

@@ -8,8 +8,7 @@ import re
 from hypothesis import given
 from hypothesis import strategies as st
 from ibrobot_serve.command import _table
-
-from ibrobot_core.app import Screen
+from ibrobot_terminal.screen import Screen
 
 HOSTILE = st.lists(
     st.sampled_from(

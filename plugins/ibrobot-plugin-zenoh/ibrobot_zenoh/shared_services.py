@@ -18,9 +18,10 @@ from ibrobot_ros2.services import (
     endpoint,
 )
 from ibrobot_ros2.workers import StopWay
+from ibrobot_terminal.describe import described, type_name
 
 from ibrobot_core.api import IbrobotError, NotSupported, Payload, TransportError, did_you_mean
-from ibrobot_core.app import Component, RunView, described, type_name
+from ibrobot_core.app import Component, RunView
 from ibrobot_zenoh.arrivals import Arrivals
 from ibrobot_zenoh.network import Link, transport_of
 from ibrobot_zenoh.options import Share

@@ -1,4 +1,4 @@
-"""The hooks: the terminal of runs, and the kinds of guides and of tables about a run."""
+"""The hooks: the terminal of runs, lists of plugins, and the kinds of guides and of tables about a run."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from ibrobot_core.api import Descriptor, Late, hookimpl
-from ibrobot_core.app import Kind
+from ibrobot_core.app import Command, Kind
 from ibrobot_terminal.guide import GuideDescriptor, PanelDescriptor
 
 
@@ -26,6 +26,14 @@ def ibrobot_terminals() -> Iterable[Descriptor[Any]]:
         summary="reads the terminal's keys, and shows a live panel",
         default=True,
     )
+
+
+@hookimpl
+def ibrobot_commands() -> Iterable[Command]:
+    """Lists of what is installed."""
+    summary = "List what the installed plugins offer."
+    yield Command("plugins", Late("ibrobot_terminal.plugin_lists:ListPlugins"), summary)
+    yield Command("plugins show", Late("ibrobot_terminal.plugin_lists:ShowPlugin"))
 
 
 @hookimpl(optionalhook=True)

@@ -15,7 +15,7 @@ from rich.segment import Segment
 from rich.table import Table
 
 from ibrobot_core.api import String
-from ibrobot_core.app import styled
+from ibrobot_terminal.screen import styled
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, override
 from rich.live import Live
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import RunDisplay, RunTerminal, Screen
+from ibrobot_core.app import RunDisplay, RunTerminal
 from ibrobot_terminal.agent_keys import AgentKeys
 from ibrobot_terminal.held_keys import RELEASE, REPEAT
 from ibrobot_terminal.key_reader import KeyReader
 from ibrobot_terminal.panel import GuardBell, RecentLog, kept_apart, panel
+from ibrobot_terminal.screen import Screen
 
 if TYPE_CHECKING:
     from ibrobot_core.app import RunHooks, Runtime

@@ -11,10 +11,11 @@ import attrs
 import pyte
 import pytest
 from ibrobot_terminal.panel import GuardBell, RecentLog, panel
+from ibrobot_terminal.screen import Screen
 from rich.live import Live
 
 from ibrobot_core.api import String
-from ibrobot_core.app import RunDisplay, Screen
+from ibrobot_core.app import RunDisplay
 
 if TYPE_CHECKING:
     from fake_runs import Runs

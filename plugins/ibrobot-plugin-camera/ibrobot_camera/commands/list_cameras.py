@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import attrs
+from ibrobot_terminal.screen import Screen, styled
 from rich.table import Table
 
 from ibrobot_camera import v4l2
-from ibrobot_core.app import Screen, echo, styled
+from ibrobot_core.app import echo
 
 
 @attrs.frozen

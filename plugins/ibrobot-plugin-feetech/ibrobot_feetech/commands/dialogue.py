@@ -11,11 +11,12 @@ from typing import override
 
 from ibrobot_terminal import Guide, KeyReader
 from ibrobot_terminal.questions import confirm, prompt
+from ibrobot_terminal.screen import Screen
 from rich.box import SIMPLE_HEAD
 from rich.live import Live
 from rich.table import Table
 
-from ibrobot_core.app import RequestError, Screen, echo
+from ibrobot_core.app import RequestError, echo
 
 _PERIOD_S = 0.03
 """Time between two updates of a table [s]."""

@@ -8,12 +8,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import attrs
+from ibrobot_terminal.screen import Screen, styled
 from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 
 from ibrobot_core.api import option
-from ibrobot_core.app import Screen, echo, styled
+from ibrobot_core.app import echo
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.commands.dialogue import table
 from ibrobot_feetech.commands.joints import Joint, by_servo, joints_of

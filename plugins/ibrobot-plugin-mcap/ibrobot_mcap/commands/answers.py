@@ -9,6 +9,7 @@ from typing import Any
 
 import attrs
 import numpy as np
+from ibrobot_terminal.screen import Screen
 from numpy.typing import NDArray
 from rich.table import Table
 
@@ -21,7 +22,7 @@ from ibrobot_core.api import (
     RecorderError,
     option,
 )
-from ibrobot_core.app import Screen, wrong_input
+from ibrobot_core.app import wrong_input
 
 
 @attrs.frozen(eq=False)

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_terminal.screen import Screen, styled
 from rich.table import Table
 
 from ibrobot_core.api import EpisodeAddress, EpisodeSummary, RecorderError, option
-from ibrobot_core.app import Screen, Unsuccessful, echo, styled, wrong_input
+from ibrobot_core.app import Unsuccessful, echo, wrong_input
 
 _WIDE = 100
 """Width of a terminal with enough room for prompts and years [columns]."""

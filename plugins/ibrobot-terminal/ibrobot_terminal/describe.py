@@ -8,8 +8,7 @@ from typing import Any, get_args
 
 import attrs
 
-from ibrobot_core.config.show import plain
-from ibrobot_core.options import default_of, fields
+from ibrobot_core.app import default_of, fields, plain
 
 
 @attrs.frozen

@@ -9,7 +9,7 @@ from typing import Any, override
 from rich.console import Console
 from rich.text import Text
 
-from ibrobot_core.safe_output import printable
+from ibrobot_core.app import printable
 
 
 class Screen(Console):

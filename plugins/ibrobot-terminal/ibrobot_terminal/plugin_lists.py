@@ -8,10 +8,8 @@ from typing import Any
 
 import attrs
 
-from ibrobot_core.errors import PluginError
-from ibrobot_core.options import did_you_mean, option
-from ibrobot_core.plugins import Entry, Registry, installed_plugins
-from ibrobot_core.safe_output import echo
+from ibrobot_core.api import did_you_mean, option
+from ibrobot_core.app import Registry, RequestError, echo, installed_plugins
 
 
 @attrs.frozen
@@ -19,8 +17,9 @@ class ListPlugins:
     """List the types of the installed plugins, their missing dependencies, and broken plugins."""
 
     def __call__(self) -> dict[str, list[Any]]:
+        """Rows of all types, and the failures of plugins."""
         registry = installed_plugins()
-        rows = [_row(registry, registry.entries[key]) for key in sorted(registry.entries)]
+        rows = [_row(registry, key) for key in sorted(registry.entries)]
         return {"plugins": rows, "broken": registry.failures}
 
     def show(self, listed: dict[str, list[Any]]) -> None:
@@ -44,35 +43,43 @@ class ShowPlugin:
     type: str = option(typed="TYPE", help="the value of `type` in a robot YAML")
 
     def __call__(self) -> list[dict[str, Any]]:
-        from ibrobot_core.config.describe import described
+        """The rows of the type, with its options."""
+        from ibrobot_terminal.describe import described
 
         registry = installed_plugins()
-        entries = [registry.entries[key] for key in sorted(registry.entries) if key[1] == self.type]
-        if not entries:
+        keys = [key for key in sorted(registry.entries) if key[1] == self.type]
+        if not keys:
             remark = did_you_mean(self.type, sorted({t for _, t in registry.entries}), "installed")
-            raise PluginError(f"unknown type {self.type!r}{remark}{registry.broken}")
-        return [{**_row(registry, each), "options": list(described(each.descriptor.options))} for each in entries]
+            raise RequestError(f"unknown type {self.type!r}{remark}{registry.broken}")
+        options = {key: list(described(registry.entries[key].descriptor.options)) for key in keys}
+        return [{**_row(registry, key), "options": options[key]} for key in keys]
 
     def show(self, matching: list[dict[str, Any]]) -> None:
         """Print a table for each type."""
         columns = ("name", "type", "unit", "default", "allowed", "help")
+        printed: dict[str, Any] = {}
         for one in matching:
             echo(f"{one['kind']} type {one['type']} ({one['package']} {one['version']}): {one['summary']}")
             if one["missing"] is not None:
                 echo(f"lacking: {_lacking(one)}")
-            if rows := [[_text(getattr(each, column)) for column in columns] for each in one["options"]]:
-                _print_table(columns, rows)
-            else:
+            rows = [[_text(getattr(each, column)) for column in columns] for each in one["options"]]
+            same = next((kind for kind, earlier in printed.items() if earlier == rows), None)
+            if not rows:
                 echo("no options")
+            elif same is not None:
+                echo(f"its options are those of {same} type {one['type']}")
+            else:
+                _print_table(columns, rows)
+                printed[one["kind"]] = rows
 
 
-def _row(registry: Registry, entry: Entry) -> dict[str, Any]:
-    key = entry.kind, entry.descriptor.type
+def _row(registry: Registry, key: tuple[str, str]) -> dict[str, Any]:
+    entry = registry.entries[key]
     missing = None if key in registry.doubles else registry.missing(*key)
     lacking = missing and {"what": missing.missing, "apt": list(missing.apt), "remedy": missing.remedy}
     return {
-        "kind": entry.kind,
-        "type": entry.descriptor.type,
+        "kind": key[0],
+        "type": key[1],
         "package": entry.package,
         "version": entry.version,
         "summary": entry.descriptor.summary,
@@ -92,7 +99,7 @@ def _print_table(columns: tuple[str, ...], rows: list[list[str]]) -> None:
     """Print a table as wide as the terminal; without a terminal, print all cells in full."""
     from rich.table import Table
 
-    from ibrobot_core.screen import Screen
+    from ibrobot_terminal.screen import Screen
 
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in columns:
