@@ -22,7 +22,7 @@ class ComponentConfig:
     simulates: ClassVar[bool] = False
     """Whether hardware in this section is simulated."""
 
-    type: str = option(help="type of plugin; `ibrobot plugins` lists them")
+    type: str = option(help="type of plugin, one of those installed")
     options: Any = not_a_key()
     """An instance of the plugin's options class."""
 

@@ -62,7 +62,7 @@ def option(
 
     Args:
         default: default value; without one, the option is required.
-        unit: SI unit or word, shown by `ibrobot plugins show` and in the JSON Schema.
+        unit: SI unit or word, shown in lists of options and in the JSON Schema.
         help: one-line description.
         ge: lower bound, inclusive.
         gt: lower bound, exclusive.

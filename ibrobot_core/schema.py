@@ -316,7 +316,7 @@ class InferenceConfig(ComponentConfig):
     plugin_kind = "engine"
 
     model: str = option(help="a name under models")
-    type: str = option("monolithic", key="execution_mode", help="engine to run the model; `ibrobot plugins` lists them")
+    type: str = option("monolithic", key="execution_mode", help="engine to run the model, one of those installed")
     request_timeout: float = option(5.0, unit="s", gt=0, help="time after which a request fails and the arm holds")
     prompt: str = option("", help="task for language-conditioned policies")
     intervene: str | Mapping[str, str] | None = option(
