@@ -23,6 +23,8 @@ from PIL import Image
 
 from ibrobot_core.api import Header, SensorError
 
+from .lens_rays import directions
+
 SIZE = 640, 480
 LENS = np.array([[560.0, 0.0, 327.0], [0.0, 555.0, 236.0], [0.0, 0.0, 1.0]])
 BARREL = np.array([-0.25, 0.08, 0.001, -0.0005, 0.0])
@@ -41,15 +43,7 @@ POSES = [
 
 @cache
 def rays(size: tuple[int, int]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Directions of the pixels in the frame of the camera, shape (H * W, 3): the inverse of the distortion."""
-    columns, rows = np.meshgrid(np.arange(size[0], dtype=np.float64), np.arange(size[1], dtype=np.float64))
-    bent = np.stack([(columns - LENS[0, 2]) / LENS[0, 0], (rows - LENS[1, 2]) / LENS[1, 1]])
-    (x, y), (k1, k2, p1, p2, _) = bent, BARREL
-    for _ in range(40):  # by its fixed point
-        square = x * x + y * y
-        shift = np.stack([2 * p1 * x * y + p2 * (square + 2 * x * x), p1 * (square + 2 * y * y) + 2 * p2 * x * y])
-        x, y = (bent - shift) / (1 + k1 * square + k2 * square**2)
-    return np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+    return directions(LENS, BARREL, size)
 
 
 @cache

@@ -51,6 +51,8 @@ class MakeBoard(Board):
 class CalibrateCamera(Board):
     """Measure the lens of a camera with a printed board; see `ibrobot camera board`.
 
+    A plain chessboard does, too, with --chessboard; --columns and --rows count its squares, not its inner corners.
+
     SOURCE is a device, a robot YAML with one `opencv` camera or with --camera, or a folder of pictures. Of a camera,
     pictures are taken by themselves while you show the board: hold it still for a moment in each place. The focus must
     not change afterwards, so switch autofocus off before.
@@ -63,6 +65,7 @@ class CalibrateCamera(Board):
     output: Path | None = option(
         None, typed="-o FILE", help="the file to write, by default NAME.yaml; it is replaced if it exists"
     )
+    chessboard: bool = option(False, help="the board is a plain chessboard, without markers, and seen whole")
     views: int = option(VIEWS, ge=FEWEST_VIEWS, le=200, help="number of views to take")
     seconds: float = option(300.0, gt=0, unit="s", help="time after which the views that were taken must suffice")
 
@@ -93,11 +96,19 @@ class CalibrateCamera(Board):
             picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
             if picture is None:
                 raise SensorError(f"{path}: is not a picture that can be read")
-            if (view := find(np.asarray(picture, np.uint8), self, path.name)) is not None:
+            if (view := self._find(np.asarray(picture, np.uint8), path.name)) is not None:
                 views.append(view)
             else:
                 echo(f"{path.name}: too little of the board is seen", err=True)
+        if not views:
+            corners = f"{self.columns - 1} x {self.rows - 1} inner corners"
+            seen = f"chessboard with {corners}" if self.chessboard else f"board with markers and {corners}"
+            other = "" if self.chessboard else "; a plain chessboard needs --chessboard"
+            raise SensorError(f"{folder}: no picture shows a {seen}: do --columns and --rows count the squares?{other}")
         return views
+
+    def _find(self, picture: NDArray[np.uint8], name: str) -> View | None:
+        return find(picture, self, name, markers=not self.chessboard)
 
     def _live(self, read: Read) -> list[View]:
         views, hint, told_s, end_s = Views(), "", 0.0, time.monotonic() + self.seconds
@@ -106,7 +117,7 @@ class CalibrateCamera(Board):
                 hint, told_s = missing, now_s
                 echo(f"{len(views.views)} of {self.views} views; {hint}")
             picture = read(min(1.0, end_s - now_s))
-            if picture is not None and views.add_live(find(picture, self, f"view {len(views.views) + 1}")):
+            if picture is not None and views.add_live(self._find(picture, f"view {len(views.views) + 1}")):
                 echo("\a", nl=False)
         return views.views
 

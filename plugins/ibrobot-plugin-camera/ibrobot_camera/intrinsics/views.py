@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_camera.intrinsics.board import Board
+from ibrobot_camera.intrinsics.chessboard import find_corners
 
 FEWEST_CORNERS = 12
 CELLS = (("upper left", "top", "upper right"), ("left", "middle", "right"), ("lower left", "bottom", "lower right"))
@@ -20,6 +21,7 @@ _TILT = 0.12
 """Perspective of a board that counts as tilted; about 15 degrees at a common lens."""
 _NEAR, _FAR = 0.6, 0.4
 """Share of the picture's width that a near board fills at least, and a far one at most."""
+_NOTHING = np.zeros((0, 2), np.float32), np.zeros(0, np.int32)
 _STILL = 0.002
 """Greatest motion between two pictures of a board that is held still, as a share of the picture's width."""
 
@@ -50,20 +52,34 @@ class View:
         return {CELLS[row][column] for row, column in zip(rows, columns, strict=True)}
 
 
-def find(picture: NDArray[np.uint8], board: Board, name: str = "") -> View | None:
-    """The board in a picture, grey or BGR; None if too little of it is seen."""
-    grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-    corners, ids, _, _ = board.detector.detectBoard(grey)
-    if ids is None or len(ids) < FEWEST_CORNERS:
+def find(picture: NDArray[np.uint8], board: Board, name: str = "", *, markers: bool = True) -> View | None:
+    """The board in a picture, grey or BGR; None if too little of it is seen.
+
+    Without `markers`, it is a plain chessboard with as many squares, and all of it must be seen.
+    """
+    grey = np.asarray(picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
+    corners, ids = _marked(grey, board) if markers else _plain(grey, board)
+    if len(ids) < FEWEST_CORNERS:
         return None
-    # OpenCV 4 gives them as (N, 1, 2) and (N, 1), OpenCV 5 as (N, 2) and (N,).
-    corners, ids = np.asarray(corners, np.float32).reshape(-1, 2), np.asarray(ids, np.int32).reshape(-1)
     points = np.asarray(board.pattern.getChessboardCorners(), np.float32).reshape(-1, 3)[ids]
     if min(len(np.unique(points[:, 0])), len(np.unique(points[:, 1]))) < 3:
         return None  # a strip of the board says nothing about its tilt
     height, width = grey.shape[:2]
     place = _place(corners, points, board, (width, height))
     return None if place is None else View(name, (width, height), ids, corners, points, place)
+
+
+def _marked(grey: NDArray[np.uint8], board: Board) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    corners, ids, _, _ = board.detector.detectBoard(grey)
+    if ids is None:
+        return _NOTHING
+    # OpenCV 4 gives them as (N, 1, 2) and (N, 1), OpenCV 5 as (N, 2) and (N,).
+    return np.asarray(corners, np.float32).reshape(-1, 2), np.asarray(ids, np.int32).reshape(-1)
+
+
+def _plain(grey: NDArray[np.uint8], board: Board) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    corners = find_corners(grey, (board.columns - 1, board.rows - 1))
+    return _NOTHING if corners is None else (corners, np.arange(len(corners), dtype=np.int32))
 
 
 def _place(
