@@ -7,7 +7,7 @@ import json
 import logging
 import re
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import files
 from pathlib import Path
 from typing import Any
@@ -108,7 +108,8 @@ class Judge:
     """MuJoCo's collision detection for an arm, a table and objects that are somewhere else each time."""
 
     def __init__(self, station: Station) -> None:
-        robot, self.objects, self._seen = station.robot, dict[str, WorldObject](), station.seen
+        self.robot = robot = station.robot
+        self.objects, self._seen = dict[str, WorldObject](), station.seen
         path, arms = robot.description.mjcf, robot.description.arms
         assert path is not None
         spec = several_arms(path, arms) if arms else read_mjcf(path).spec.copy()
@@ -213,18 +214,21 @@ class Judge:
     def leads_in(self, first: Vector, begin: Vector, end: Vector) -> bool:
         """Whether a way leads a pair that is too near a millimetre nearer than at a first configuration.
 
-        By `distance`, since contacts may say a depth that is a millimetre or two off.
+        By `distance`, since contacts lack pairs, and say depths that are a millimetre or two off.
         """
-        before = min(self._beyond(first), 0.0)
-        return any(self._beyond(begin + share * (end - begin)) < before - 0.001 for share in (0.25, 0.5, 0.75, 1.0))
+        way = [begin + share * (end - begin) for share in (0.25, 0.5, 0.75, 1.0)]
+        pairs: dict[frozenset[str], float] = {}
+        for q in (first, *way):
+            _, required, geoms = self.look(q)
+            pairs |= {
+                frozenset(self._names[geom] for geom in pair): keep for pair, keep in zip(geoms, required, strict=True)
+            }
 
-    def _beyond(self, q: Vector) -> float:
-        """As the second of `room`, by `distance`."""
-        _, required, geoms = self.look(q)
-        pairs = {
-            frozenset(self._names[geom] for geom in pair): least for pair, least in zip(geoms, required, strict=True)
-        }
-        return min((self.distance(q, set(names)) - least for names, least in pairs.items()), default=self._seen)
+        def beyond(q: Vector) -> float:
+            return min((self.distance(q, set(names)) - keep for names, keep in pairs.items()), default=self._seen)
+
+        before = min(beyond(first), 0.0)
+        return any(beyond(q) < before - 0.001 for q in way)
 
     def along(self, begin: Vector, end: Vector) -> tuple[float, float]:
         """As `room`, the least on the straight way between two commands."""
@@ -609,7 +613,8 @@ def backs_out(station: Station, judge: Judge, seed: int, *, guarded: bool = True
     """Near objects or in contact, an operator drives joints the way that leads out: what went wrong, or empty.
 
     The operator sees which joint, forwards or backwards, leads farther from what is too near, and drives it; if it does
-    not move, another one. Where this does not lead out without the guard either, another state takes its place.
+    not move, another one; if none does, two at once, by both sticks. Where this does not lead out without the guard
+    either, another state takes its place.
     """
     rng, robot = np.random.default_rng(seed), station.robot
     judge.put({})
@@ -626,30 +631,50 @@ def backs_out(station: Station, judge: Judge, seed: int, *, guarded: bool = True
         clear, inside = (at, inside) if room > wanted else (clear, at)
     loop = Loop(station, clear, guarded=guarded)
     loop.world(WorldChange(judge.objects))
-    tilts = 0.05 * np.concatenate([np.eye(len(clear)), -np.eye(len(clear))])
+    alone = 0.05 * np.concatenate([np.eye(len(clear)), -np.eye(len(clear))])
+    together = np.array([a + b for a, b in itertools.combinations(alone, 2) if (a + b).any()])
     room = first = judge.room(loop.position)[1]
-    vain: set[int] = set()
+    vain: set[bytes] = set()
     """Ways that have moved nothing since another one moved the arm."""
     for _ in range(400):
-        ways = np.clip(loop.position + tilts, robot.lower, robot.upper)
-        rooms = np.array([-np.inf if number in vain else judge.room(q)[1] for number, q in enumerate(ways)])
-        best = int(np.argmax(rooms))
-        if rooms[best] < room + 1e-5:  # none leads farther: the operator tries another one
-            best = int(rng.choice(np.flatnonzero(np.isfinite(rooms)))) if np.isfinite(rooms).any() else best
+        way = _way_out(judge, loop.position, (alone, together), vain, rng)
+        if way is None:
+            break
         begin = loop.position.copy()
+        goal = np.clip(begin + way, robot.lower, robot.upper)
         for _ in range(12):
             before = loop.position
-            now = judge.along(before, loop.tick(ways[best]))[1]
+            now = judge.along(before, loop.tick(goal))[1]
             if guarded and now < min(room, 0.0) - 0.001 and judge.leads_in(begin, before, loop.position):
                 return f"seed {seed}: from {1e3 * room:.2f} to {1e3 * now:.2f} mm, further in"
             if np.array_equal(loop.position, before):
                 break
-        vain = vain | {best} if np.abs(loop.position - begin).max() < 1e-3 else set()
+        vain = vain | {way.tobytes()} if np.abs(loop.position - begin).max() < 1e-3 else set()
         room = judge.room(loop.position)[1]
         if room > 0.001:
             return ""
-        if len(vain) == len(tilts):
-            break
     if guarded and backs_out(station, judge, seed, guarded=False):
         return backs_out(station, judge, seed + 100_000)
     return f"seed {seed}: from {1e3 * first:.2f} mm it came to {1e3 * room:.2f} mm"
+
+
+def _way_out(
+    judge: Judge, at: Vector, ways: Sequence[Vector], vain: set[bytes], rng: np.random.Generator
+) -> Vector | None:
+    """The motion of the first kind that has one that leads farther out; without any, a motion by chance.
+
+    Args:
+        judge: for distances.
+        at: where the arm is, shape (J,).
+        ways: kinds of motions, each of shape (N, J).
+        vain: motions that are not tried.
+        rng: for chance.
+    """
+    robot, room = judge.robot, judge.room(at)[1]
+    for kind in ways:
+        left = np.array([way for way in kind if way.tobytes() not in vain])
+        rooms = [judge.room(q)[1] for q in np.clip(at + left, robot.lower, robot.upper)] if len(left) else []
+        if max(rooms, default=-np.inf) > room + 1e-5:
+            return np.asarray(left[int(np.argmax(rooms))])
+    left = np.array([way for way in ways[0] if way.tobytes() not in vain])
+    return np.asarray(rng.choice(left)) if len(left) else None
