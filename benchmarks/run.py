@@ -175,7 +175,7 @@ CLAIMS = (
     ),
     Claim(
         "can_arm",
-        "a read of eight CAN motors takes at most 1.5x the same frames by python-can alone",
+        "a read of eight CAN motors takes at most 1.25x the same frames by python-can alone",
         "docs/decisions/0070-what-drivers-of-arms-share.md",
         "can_arm.py",
     ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import select
 import shlex
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -380,9 +381,22 @@ class DamiaoBus:
         """What has arrived already."""
         messages: list[can.Message] = []
         timeout_s = _SOCKET_S if "://" in self.channel.name else 0.0
-        while len(messages) < _DRAIN and (message := self._receive(timeout_s)) is not None:
-            messages.append(message)
+        for _ in range(_DRAIN):
+            arrived = self._has_arrived()
+            if arrived is False:
+                break
+            if (message := self._receive(timeout_s)) is not None:
+                messages.append(message)
+            elif arrived is None:
+                break
         return messages
+
+    def _has_arrived(self) -> bool | None:
+        """Whether there is something to read, at least a part of a frame; None if only a read can tell."""
+        try:
+            return bool(select.select([self._opened()], [], [], 0)[0])
+        except (NotImplementedError, ValueError, OSError, can.CanError):  # no file descriptor, or one that is gone
+            return None
 
     def _drain(self) -> None:
         """Throw away what came unasked, e.g. the feedback to commands."""
@@ -400,7 +414,7 @@ class DamiaoBus:
                 message = self._opened().recv(max(0.0, until_s - time.monotonic()))
             except (can.CanError, SerialException, OSError) as error:
                 raise BusError(f"{self.place()}: has failed: {error}; {self.channel.remedy}") from error
-            except ValueError:  # a damaged line of a serial adapter
+            except (ValueError, IndexError):  # a damaged line of a serial adapter
                 self.counters["strange_frames"] += 1
                 continue
             if message is None or not message.is_error_frame:

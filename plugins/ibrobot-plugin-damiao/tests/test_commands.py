@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import select
 import shlex
 import socket
 import subprocess
@@ -11,12 +12,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import can
 import pytest
 import yaml
 from click.testing import CliRunner
-from ibrobot_damiao import bus
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from ibrobot_damiao import bus, protocol
 from ibrobot_damiao.bus import Channel, DamiaoBus
-from ibrobot_damiao.emulator import EmulatedMotor, EmulatedMotors
+from ibrobot_damiao.emulator import EmulatedMotor, EmulatedMotors, serve
 from ibrobot_damiao.emulator.serve import SlcanServer
 from ibrobot_testing import ibrobot_command
 from ibrobot_testing.command import command_line
@@ -250,3 +254,51 @@ def test_a_pulled_cable_ends_a_request_with_what_to_check(adapter: SlcanServer) 
             opened.ask(1)
     finally:
         opened.close()
+
+
+@pytest.fixture
+def opened(adapter: SlcanServer) -> Iterator[DamiaoBus]:
+    """A bus on which motors 1 and 2 were found."""
+    opened = DamiaoBus(Channel(adapter.channel))
+    opened.open()
+    try:
+        opened.find(1)
+        opened.find(2)
+        yield opened
+    finally:
+        opened.close()
+
+
+def test_request_on_a_silent_bus_waits_for_nothing_but_its_answers(
+    opened: DamiaoBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A look for old frames that reads, in place of asking whether there are any, costs half as much as the answers."""
+    receive, read = can.BusABC.recv, []
+
+    def counted(bus: can.BusABC, timeout: float | None = None) -> can.Message | None:
+        read.append(message := receive(bus, timeout))
+        return message
+
+    monkeypatch.setattr(can.BusABC, "recv", counted)
+    assert opened.refresh((1, 2), 10.0).keys() == {1, 2}
+    assert [message.arbitration_id for message in read if message is not None] == [0x11, 0x12]
+    assert len(read) == 2
+
+
+def test_feedback_that_came_before_a_request_is_not_its_answer(adapter: SlcanServer, opened: DamiaoBus) -> None:
+    for number in range(20):
+        opened.send(1, protocol.command(protocol.DISABLE))
+        assert select.select([opened._opened()], [], [], 10.0)[0]
+        adapter.motors[1].angle = number / 10
+        assert opened.ask(1).position == pytest.approx(number / 10, abs=1e-3)
+    assert opened.counters["strange_frames"] == 0
+
+
+@given(kind=st.sampled_from("tTrRdDbBxzF"), rest=st.text("0123456789ABCDEF", max_size=30))
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_damaged_line_of_an_adapter_costs_at_most_a_retry(opened: DamiaoBus, kind: str, rest: str) -> None:
+    """Also one that was cut, e.g. `t12`, whose parts are missing."""
+    original = serve.line_of
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(serve, "line_of", lambda frame: f"{kind}{rest}\r".encode() + original(frame))
+        assert opened.ask(1).motor == 1
