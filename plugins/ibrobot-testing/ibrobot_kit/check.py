@@ -24,6 +24,36 @@ HEAVY = ("av", "cv2", "lerobot", "mujoco", "numpy", "pinocchio", "pyarrow", "sci
 _CORE = "ibrobot-core"
 _HOOK = re.compile(r"SKIPPED .*: override (\w+) to have")
 """What the suites say of a check that needs a hook."""
+_WEIGHED = """
+import importlib, json, sys
+from dis import opname
+
+_, module, heavy, *required = sys.argv
+for each in required:
+    importlib.import_module(each)
+before, own, lines = set(sys.modules), module.partition(".")[0], {}
+
+
+class Watch:
+    def find_spec(self, name, path=None, target=None):
+        frame = sys._getframe(1)
+        while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] != own:
+            frame = frame.f_back
+        if frame is not None and name not in lines:
+            code = frame.f_code
+            instruction, argument = code.co_code[frame.f_lasti : frame.f_lasti + 2]
+            # `from ibrobot_core.api import NAME` imports what NAME needs.
+            needs = f", for {code.co_names[argument]}" if opname[instruction] == "IMPORT_FROM" else ""
+            lines[name] = f"{code.co_filename}:{frame.f_lineno}{needs}"
+
+
+sys.meta_path.insert(0, Watch())
+importlib.import_module(module)
+loaded = [name for name in json.loads(heavy) if name in sys.modules and name not in before]
+print(json.dumps({name: lines.get(name, "") for name in loaded}))
+"""
+"""Imports a module, and prints which heavy packages that imports, each with the line of the module's package that
+brings it."""
 _TESTS_S = 600.0
 _NAMED = 8
 """How many tests that fail are named."""
@@ -113,17 +143,19 @@ def _required(package: Distribution) -> list[str]:
 
 
 def _weight(module: str, required: Sequence[str]) -> Check:
-    """Check which heavy packages discovery imports because of `module`, beyond those of `required`."""
-    before = "".join(f"import {each}\n" for each in required)
-    listed = f"[name for name in {HEAVY!r} if name in sys.modules and name not in before]"
-    code = f"import json, sys\n{before}before = set(sys.modules)\nimport {module}\nprint(json.dumps({listed}))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    """Check which heavy packages discovery imports because of `module`, beyond those of `required`; name the lines."""
+    command = [sys.executable, "-c", _WEIGHED, module, json.dumps(HEAVY), *required]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     if done.returncode:
         lines = done.stderr.strip().splitlines() or ["it ended without a word"]
         return Check("weight", False, f"{module} cannot be imported alone: {lines[-1]}")
-    loaded = json.loads(done.stdout.splitlines()[-1])
-    remedy = 'each ibrobot command imports that: import it in `make`, e.g. by Late("MODULE:NAME")'
-    return Check("weight", not loaded, f"{module} imports {', '.join(loaded) or 'nothing heavy'}", remedy)
+    loaded: dict[str, str] = json.loads(done.stdout.splitlines()[-1])
+    told = ", ".join(f"{name} ({line})" if line else name for name, line in loaded.items())
+    remedy = (
+        'each ibrobot command imports that: import it in `make`, e.g. by Late("MODULE:NAME"), '
+        "or under `if TYPE_CHECKING:` if only annotations use it"
+    )
+    return Check("weight", not loaded, f"{module} imports {told or 'nothing heavy'}", remedy)
 
 
 def _described(name: str, descriptor: Descriptor[Any]) -> Iterator[Check]:
@@ -137,6 +169,9 @@ def _described(name: str, descriptor: Descriptor[Any]) -> Iterator[Check]:
         yield Check(name, True, "options have help" if options else "it has no options")
     if not descriptor.summary:
         yield Check(name, False, "it has no summary", "lists of plugins show it")
+    if inspect.isclass(descriptor.make):
+        yield _made(name, f"{descriptor.make.__module__}:{descriptor.make.__qualname__}", descriptor.make)
+        return
     places = _places(descriptor.make)
     if not places:
         yield Check(name, False, "make is a function: what it makes was not looked at", matters=False)
@@ -146,10 +181,15 @@ def _described(name: str, descriptor: Descriptor[Any]) -> Iterator[Check]:
         except Exception as error:  # noqa: BLE001 - whatever the plugin raises
             text = f"{late.place} cannot be imported: {error}"
             yield Check(name, False, text, _remedy(error, late.place.partition(".")[0]))
-            continue
-        lacking = sorted(made.__abstractmethods__) if inspect.isabstract(made) else []
-        text = f"{made.__name__} lacks {', '.join(lacking)}" if lacking else f"{late.place} is there"
-        yield Check(name, not lacking, text, "define these methods")
+        else:
+            yield _made(name, late.place, made)
+
+
+def _made(name: str, place: str, made: Any) -> Check:
+    """Whether what a descriptor makes is complete."""
+    lacking = sorted(made.__abstractmethods__) if inspect.isabstract(made) else []
+    text = f"{made.__name__} lacks {', '.join(lacking)}" if lacking else f"{place} is there"
+    return Check(name, not lacking, text, "define these methods")
 
 
 def _remedy(error: Exception, own: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import ClassVar
+from typing import ClassVar, get_args
 
 import numpy as np
 import pytest
@@ -207,6 +207,8 @@ class TeleopSuite(Suite[Teleop]):
         """Each press of a button gives its event once, even while the deadman is released, and none before."""
         if not self.events:
             pytest.skip("has no buttons")
+        unknown = [event for event in self.events if event not in get_args(OperatorEvent)]
+        assert not unknown, f"no event of an operator: {unknown}; there are {', '.join(get_args(OperatorEvent))}"
         with self.connected() as (teleop, ctx):
             pose = self.poses(ctx)[0]
             teleop.begin_operation(self._measure(ctx, pose))

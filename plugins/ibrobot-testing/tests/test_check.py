@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -74,7 +75,7 @@ def test_good_package_fails_nothing_and_says_what_was_not_run(site: Site, capsys
          "type 'my wave' is not a name: use letters, digits and _, e.g. my_arm; "
          "nothing, or not all, of what it offers is used"),
         ("import attrs\n", "import attrs, numpy\n", "weight",
-         'fake_wave imports numpy; each ibrobot command imports that: import it in `make`, e.g. by Late("MODULE:NAME'),
+         '; each ibrobot command imports that: import it in `make`, e.g. by Late("MODULE:NAME"), or under `if TYPE_CH'),
         ("import attrs\n", "import attrs\nimport sys\nif sys.argv[0] == '-c': raise OSError('no port')\n", "weight",
          "fake_wave cannot be imported alone: OSError: no port"),
         (', help="how fast"', "", "teleop wave",
@@ -107,6 +108,23 @@ def test_what_a_required_plugin_imports_is_not_its_own_weight(site: Site, requir
     site.add("fake-base", source)
     install(site, f"import fake_base\n{PLUGIN}", requires)
     assert checks()["weight"].ok is is_light
+
+
+@pytest.mark.parametrize(
+    ("statement", "told"),
+    [
+        ("import numpy", ""),
+        ("from ibrobot_core.api import JointReading", ", for JointReading"),
+        ("import fake_base", ""),
+    ],
+)
+def test_line_that_imports_a_heavy_package_is_named(site: Site, statement: str, told: str) -> None:
+    source = site.sources / "base.py"
+    source.write_text("import numpy\n")
+    site.add("fake-base", source)
+    install(site, PLUGIN.replace("import attrs\n", f"import attrs\n\n{statement}\nimport numpy\n"))
+    file = Path(str(import_module("fake_wave").__file__))
+    assert checks()["weight"].found == f"fake_wave imports numpy ({file}:4{told})"
 
 
 def test_missing_dependency_of_an_implementation_is_named(site: Site) -> None:
@@ -149,6 +167,13 @@ def test_place_that_a_function_uses_is_looked_at(site: Site, made: str, found: s
     every = [check.found for check in examine("fake-wave", installed_plugins()) if check.name == "teleop wave"]
     assert every[0] == "it has no options"
     assert f"ibrobot_testing.fakes.host:{made} {found}" in every[1]
+
+
+def test_class_that_makes_the_object_is_looked_at(site: Site) -> None:
+    wave = "\n\nfrom ibrobot_core.api import Teleop\n\n\nclass Wave(Teleop):\n    read = connect = disconnect = print\n"
+    install(site, PLUGIN.replace('Late("ibrobot_testing.fakes.host:FakeTeleop")', "Wave") + wave)
+    every = [check for check in examine("fake-wave", installed_plugins()) if check.name == "teleop wave"]
+    assert (every[-1].ok, every[-1].found) == (True, "fake_wave:Wave is there")
 
 
 def as_source(site: Site, folder: Path) -> None:

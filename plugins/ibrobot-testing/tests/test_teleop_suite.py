@@ -206,5 +206,12 @@ def test_catches(wrong, caught_by, tmp_path):
     assert caught_by in failed_checks(Suite, tmp_path)
 
 
+def test_button_of_an_unknown_event_is_refused(tmp_path):
+    class Suite(TestTeleop):
+        events = ("success", "jump")
+
+    assert failed_checks(Suite, tmp_path) == {"each_press_is_one_event"}
+
+
 def test_every_check_catches_something():
     assert checks(TeleopSuite) == set(WRONG.values())
