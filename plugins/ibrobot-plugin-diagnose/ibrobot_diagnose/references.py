@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import attrs
+from ibrobot_provenance.datasets import element_names
 
 from ibrobot_core.api import DatasetError, EpisodeAddress, Image, JointState, RecorderError
 from ibrobot_core.app import installed_plugins
@@ -21,6 +22,7 @@ RIG = "rig.json"
 """Name of the reference of a rig in the folder of a dataset."""
 _INFO = Path("meta") / "info.json"
 _MOST_EPISODES, _HIGHEST_RATE = 1_000_000, 10_000.0
+_MOST_JOINTS = 1000
 _NO_ANGLE = 10.0
 """Positions beyond it are no radians."""
 
@@ -97,12 +99,7 @@ def _is_own(dataset: Path) -> bool:
 def _given(dataset: Path, info: Mapping[str, Any]) -> dict[str, str]:
     """What a dataset of another program does not say: a contract of its own features, in whatever unit they are."""
     features = info["features"]
-    joints = _names(features.get("action"))
-    state = _names(features.get("observation.state"))
-    if not joints or not state:
-        raise RecorderError(
-            f"{dataset}: has no features action and observation.state with names, so joints are unknown"
-        )
+    state, joints = _joints(dataset, features)
     align = {"strategy": "hold", "stamp": "header", "tol_ms": None}
     observations: dict[str, Any] = {
         "observation.state": [{
@@ -119,14 +116,39 @@ def _given(dataset: Path, info: Mapping[str, Any]) -> dict[str, str]:
             }]  # fmt: skip
     action = [{"topic": "/commands", "type": "std_msgs/msg/Float64MultiArray", "joints": joints}]
     contract = {"version": 1, "units": "SI", "rate_hz": info["fps"], "observations": observations, "action": action}
-    return {"contract": json.dumps(contract), "norm_mode": "radians"}
+    stated = {"observation.state": [f"{each}.pos" for each in state], "action": [f"{each}.pos" for each in joints]}
+    return {"contract": json.dumps(contract), "norm_mode": "radians", "names": json.dumps(stated)}
 
 
-def _names(feature: Any) -> list[str]:
-    names = feature.get("names") if isinstance(feature, dict) else None
-    if isinstance(names, dict):
-        names = next(iter(names.values()), None)
-    return [str(each).removesuffix(".pos") for each in names] if isinstance(names, list) else []
+def _joints(dataset: Path, features: Mapping[str, Any]) -> tuple[Sequence[str], Sequence[str]]:
+    """The joints of the features `observation.state` and `action`; numbered from 1 if neither names its elements.
+
+    Raises:
+        RecorderError: if one of the features is not there, or it is unknown which element belongs to which.
+    """
+    named, sizes = [], []
+    for key in ("observation.state", "action"):
+        try:
+            (size,) = (int(each) for each in features[key]["shape"])
+            if not 0 < size <= _MOST_JOINTS:
+                raise ValueError(size)
+        except (LookupError, TypeError, ValueError, OverflowError):
+            raise RecorderError(
+                f"{dataset}: has no vector {key}, so joints are unknown; its features: {', '.join(features)}"
+            ) from None
+        names = element_names(features[key].get("names"))
+        named.append([each.removesuffix(".pos") for each in names] if len(names) == len(set(names)) == size else [])
+        sizes.append(size)
+    state, action = named
+    if state and action:
+        return state, action
+    if sizes[0] != sizes[1]:
+        raise RecorderError(
+            f"{dataset}: observation.state has {sizes[0]} elements and action {sizes[1]}, and not both are named, so "
+            "it is unknown which belong together; write a name for each into `names` of both in meta/info.json"
+        )
+    joints = state or action or [f"joint_{number}" for number in range(1, sizes[0] + 1)]
+    return joints, joints
 
 
 def _shape(feature: Mapping[str, Any]) -> list[int]:

@@ -8,13 +8,16 @@ import re
 import shutil
 from importlib.util import find_spec
 
+import numpy as np
 import pytest
 import trainer
 from command_line import run_here
+from ibrobot_diagnose.commands.check import lines_of
+from ibrobot_diagnose.references import read_episode
 from ibrobot_provenance.reports import Cases, ReportDescriptor, Text
 from made_runs import Made, Run, metadata
 
-from ibrobot_core.api import DatasetError, EpisodeEnd, EpisodeStart
+from ibrobot_core.api import DatasetError, EpisodeEnd, EpisodeStart, RecorderError
 from ibrobot_core.app import installed_plugins
 
 pytestmark = [
@@ -89,6 +92,29 @@ def test_unreadable_episode_is_named_and_the_others_are_explained(folder, tmp_pa
     assert both.returncode == 1
     assert str(bad) in both.stderr
     assert both.stdout.startswith("None of the ")
+
+
+@pytest.mark.usefixtures("fork_server")
+@pytest.mark.parametrize(
+    ("damaged", "says"),
+    [
+        (1, "All 2 episodes are like one another: nothing was found; 1 of 3 episodes could not be read."),
+        (3, "Nothing was checked: 3 of 3 episodes could not be read."),
+    ],
+)
+def test_check_says_how_many_episodes_it_could_not_read(damaged, says, folder, tmp_path):
+    """That nothing was found says nothing of them."""
+    for number in range(3):
+        record(tmp_path / f"pick/episodes/episode_{number}", Run(seed=number, acts=False, seconds=5, cameras=()))
+    for number in range(damaged):
+        (bag,) = (tmp_path / f"pick/episodes/episode_{number}").glob("*.mcap")
+        bag.write_bytes(b"no bag")
+    done = run_here("datasets", "check", tmp_path / "pick", "--jobs", 1)
+    assert done.returncode == 1
+    assert done.stdout.endswith(f"{damaged} of 3 episodes could not be read{'.' if damaged == 3 else ''}\n")
+    assert done.stderr.count("unreadable: ") == damaged
+    facts = json.loads(run_here("datasets", "check", tmp_path / "pick", "--jobs", 1, "--json").stdout)
+    assert lines_of({**facts, "listed": []})[-1] == says
 
 
 @pytest.mark.usefixtures("fork_server")
@@ -255,3 +281,98 @@ def test_run_is_compared_with_one_that_worked(folder):
     both = run_here("explain", folder / "runs:1", "--against", good, "--data", folder / "demos")
     assert both.returncode == 2
     assert "exclude each other" in both.stderr
+
+
+def as_others_write(root, version, names, action=lambda entry: entry):
+    """Make a dataset of ibrobot one of another program: of version 2.1, a file of each episode and lines of JSON.
+
+    `names` is what its features say of their elements; `action` makes the entry of the actions another one.
+    """
+    import pyarrow.parquet as pq
+
+    (root / "meta/ibrobot.json").unlink()
+    info = json.loads((root / "meta/info.json").read_text())
+    for key in ("observation.state", "action"):
+        info["features"][key]["names"] = names
+    info["features"]["action"] = action(info["features"]["action"])
+    if version == "v2.1":
+        table = pq.read_table(root / "data/chunk-000/file-000.parquet")
+        numbers = table["episode_index"].to_pylist()
+        shutil.rmtree(root / "data")
+        shutil.rmtree(root / "meta/episodes")
+        (root / "meta/tasks.parquet").unlink()
+        (root / "data/chunk-000").mkdir(parents=True)
+        lines = []
+        for number in dict.fromkeys(numbers):
+            rows = table.slice(numbers.index(number), numbers.count(number))
+            pq.write_table(rows, root / f"data/chunk-000/episode_{number:06d}.parquet")
+            lines.append({"episode_index": number, "tasks": ["pick up the cube"], "length": len(rows)})
+        (root / "meta/episodes.jsonl").write_text("".join(json.dumps(each) + "\n" for each in lines))
+        (root / "meta/tasks.jsonl").write_text('{"task_index": 0, "task": "pick up the cube"}\n')
+        info |= {
+            "codebase_version": version, "chunks_size": 1000,
+            "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+        }  # fmt: skip
+    (root / "meta/info.json").write_text(json.dumps(info))
+    return root
+
+
+@pytest.fixture(scope="module")
+def plain_dataset(tmp_path_factory):
+    """A LeRobot dataset of three demonstrations without cameras, of which the second trembles."""
+    root = tmp_path_factory.mktemp("plain")
+    for number in range(3):
+        shake = 0.05 if number == 1 else 0.0
+        run = Run(seed=number, acts=False, seconds=5, cameras=(), shake=shake)
+        record(root / f"demos/episodes/episode_{number + 1:06d}", run)
+    done = run_here("convert", root / "demos", "--out", root / "set", "--jobs", 1)
+    assert done.returncode == 0, done.stderr
+    return root / "set"
+
+
+NAMED = ["pan", "lift", "elbow", "gripper"]
+
+
+@pytest.mark.parametrize(
+    ("names", "first"),
+    [
+        (NAMED, "pan"),
+        ([NAMED], "pan"),
+        ({"motors": NAMED}, "pan"),
+        ({"lift": 1, "pan": 0, "gripper": 3, "elbow": 2}, "pan"),
+        (None, "joint_1"),
+        (["state"], "joint_1"),
+        (["a", "a", "a", "a"], "joint_1"),
+    ],
+    ids=["a list", "a list in a list", "a list in an object", "places", "none", "too few", "one for all"],
+)
+def test_datasets_of_others_are_read_however_they_name_joints(names, first, plain_dataset, tmp_path):
+    root = as_others_write(shutil.copytree(plain_dataset, tmp_path / "set"), "v3.0", names)
+    window = read_episode(root.with_name("set:1"))
+    assert window.joints[0] == first
+    assert np.isfinite(window.states).all()
+
+
+@pytest.mark.usefixtures("fork_server")
+def test_dataset_of_version_2_1_is_checked(plain_dataset, tmp_path):
+    root = as_others_write(shutil.copytree(plain_dataset, tmp_path / "set"), "v2.1", [NAMED])
+    checked = json.loads(run_here("datasets", "check", root, "--json", "--jobs", 1).stdout)
+    assert (checked["episodes"], checked["unreadable"]) == (3, [])
+    assert [each["causes"][0]["name"] for each in checked["listed"]] == ["jerk"]
+    assert checked["listed"][0]["episode"].endswith(":1")
+
+
+@pytest.mark.parametrize(
+    ("names", "action", "says"),
+    [
+        (None, lambda entry: {**entry, "shape": [3]}, "observation.state has 4 elements and action 3, and not both"),
+        (NAMED, lambda entry: {**entry, "shape": [2, 2]}, "has no vector action, so joints are unknown; its features:"),
+        (NAMED, lambda entry: {**entry, "shape": [10**12]}, "has no vector action, so joints are unknown"),
+        (NAMED, lambda entry: {**entry, "shape": None}, "has no vector action, so joints are unknown"),
+    ],
+    ids=["other size", "a matrix", "too large", "no shape"],
+)
+def test_dataset_whose_joints_are_unknown_is_refused(names, action, says, plain_dataset, tmp_path):
+    root = as_others_write(shutil.copytree(plain_dataset, tmp_path / "set"), "v3.0", names, action)
+    with pytest.raises(RecorderError, match=says):
+        read_episode(root.with_name("set:0"))

@@ -97,3 +97,25 @@ class DatasetDescriptor(Descriptor[DatasetWriter]):
 
     flags: tuple[str, ...] = ()
     """The options that are flags of the convert command, too."""
+
+
+def element_names(names: Any) -> tuple[str, ...]:
+    """The names of a feature's elements, in their order; empty if they are absent or have no known order.
+
+    LeRobot and its converters write a list, a list in a dict (`{"motors": ["pan", "lift"]}`) or positions
+    (`{"pan": 0, "lift": 1}`). Several lists in a dict do not say which comes first.
+
+    Args:
+        names: `names` in the feature's entry of `info.json`.
+    """
+    while isinstance(names, dict | list) and len(names) == 1:
+        [inner] = names.values() if isinstance(names, dict) else names
+        if not isinstance(inner, dict | list):
+            break
+        names = inner
+    if isinstance(names, dict):
+        places = {place: name for name, place in names.items() if type(place) is int}
+        names = [places.get(place) for place in range(len(names))]
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        return ()
+    return tuple(names)

@@ -52,7 +52,7 @@ class CheckDataset(CheckOptions):
             emit(CheckReport(out=str(self.out or ""), lines=tuple(lines_of(checked))))
             return None
         if checked["unreadable"]:
-            for each in checked["unreadable"]:
+            for each in dict.fromkeys(checked["unreadable"]):  # of a dataset as a whole, it is the same for all
                 echo(f"unreadable: {each}", err=True)
             raise Unsuccessful(checked)
         return checked
@@ -173,18 +173,22 @@ def _seen(window: Window, at_s: float) -> Iterator[Shown]:
 
 def lines_of(checked: Mapping[str, Any]) -> list[str]:
     """A line for each listed episode, worst first, and each cause with a mistake; at last the counts."""
-    listed, of = checked["listed"], checked["episodes"]
+    listed, of = checked["listed"], checked["episodes"] - len(checked["unreadable"])
+    lacking = f"{len(checked['unreadable'])} of {checked['episodes']} episodes could not be read"
     untested = [
         f"Not tested{'' if each['episodes'] == of else f' in {each["episodes"]} of {of} episodes'}: "
         f"{each['name']}, since {each['why']}."
         for each in checked["untested"]
     ]
+    if not of:
+        return [*untested, f"Nothing was checked: {lacking}."]
+    rest = f"; {lacking}" if checked["unreadable"] else ""
     if not listed:
-        return [*untested, f"All {of} episodes are like one another: nothing was found."]
+        return [*untested, f"All {of} episodes are like one another: nothing was found{rest}."]
     lines = []
     for each in listed:
         first, *others = each["causes"]
         more = f" Also: {', '.join(other['name'] for other in others)}." if others else ""
         lines.append(f"{each['episode']}: {first['text']}{more}")
     names = ", ".join(f"{name} {count}" for name, count in checked["counts"].items())
-    return [*lines, *untested, f"{len(listed)} of {of} episodes to look at: {names}"]
+    return [*lines, *untested, f"{len(listed)} of {of} episodes to look at: {names}{rest}"]
