@@ -79,11 +79,15 @@ def _pushed(picture: Picture.Image) -> Picture.Image:
     return Picture.fromarray(np.where(seen[..., None], np.asarray(turned), np.asarray(picture)))
 
 
+def _unchanged() -> Callable[[Pixels, float], Pixels]:
+    return _same
+
+
 @attrs.frozen
 class Fault:
     """A fault that is laid over a recording."""
 
-    looks: Callable[[], Callable[[Pixels, float], Pixels]] = lambda: _same
+    looks: Callable[[], Callable[[Pixels, float], Pixels]] = _unchanged
     """Makes what becomes of the pictures of the first camera."""
     reads: Callable[[Floats], Floats] = lambda positions: positions
     """What becomes of positions and commands [rad], shape (N, J)."""
@@ -153,15 +157,22 @@ class Changed(EpisodeReader):
 
 
 def seen(episode: Path, fault: Fault) -> Window:
-    """A recording with a fault.
+    """A recording with the pictures of a fault.
 
     Raises:
         IbrobotError: if it cannot be read.
     """
     with patch.object(window, "read_window", lambda reader, name: read_window(Changed(reader, fault), name)):
-        found = read_episode(episode)
-    tracks = (attrs.evolve(each, values=fault.reads(each.values)) for each in (found.state, found.command))
-    return attrs.evolve(found, **dict(zip(("state", "command"), tracks, strict=True)))
+        return read_episode(episode)
+
+
+def with_fault(episode: Path, plain: Window, fault: Fault) -> Window:
+    """A recording with a fault; it is read again only if its pictures become others."""
+    found = plain if fault.looks is _unchanged and not fault.exchanged else seen(episode, fault)
+    tracks = {"state": found.state, "command": found.command}
+    return attrs.evolve(
+        found, **{name: attrs.evolve(each, values=fault.reads(each.values)) for name, each in tracks.items()}
+    )
 
 
 def main() -> int:
@@ -171,17 +182,20 @@ def main() -> int:
     parser.add_argument("--held", type=int, default=4, help="episodes that are explained")
     parser.add_argument("--faults", nargs="*", choices=[each for each in FAULTS if each], help="some of them")
     arguments = parser.parse_args()
-    maker, held, known = Maker(), [], 0
+    maker, held, known = Maker(), dict[Path, Window](), 0
     for episode in find_episodes([arguments.dataset]):
+        if len(held) == arguments.held:
+            break
         try:
-            if known < arguments.data:
-                maker.add(seen(episode, FAULTS[""]))
-                known += 1
-            elif len(held) < arguments.held:
-                seen(episode, FAULTS[""])
-                held.append(episode)
+            found = seen(episode, FAULTS[""])
         except IbrobotError as error:
             print(f"left out: {error}", file=sys.stderr)
+            continue
+        if known < arguments.data:
+            maker.add(found)
+            known += 1
+        else:
+            held[episode] = found
     reference = Reference(maker.card())
     cameras = len(reference.card.cameras) if reference.card is not None else 0
     right, named = Counter[str](), Counter[tuple[str, str]]()
@@ -190,11 +204,12 @@ def main() -> int:
         if (not arguments.faults or name in ("", *arguments.faults)) and (cameras > 1 or not fault.exchanged)
     ]  # fmt: skip
     for name in faults:
-        for episode in held:
-            first = diagnose(seen(episode, FAULTS[name]), reference).first
-            right[name] += first == name
-            named[name, first] += first != name
-            print(name or "no fault", episode.name, first or "-", file=sys.stderr, flush=True)
+        for episode, plain in held.items():
+            diagnosis = diagnose(with_fault(episode, plain, FAULTS[name]), reference)
+            right[name] += diagnosis.first == name
+            named[name, diagnosis.first] += diagnosis.first != name
+            said = [(each.name, round(each.evidence.likelihood, 2)) for each in diagnosis.findings]
+            print(name or "no fault", episode.name, said, file=sys.stderr, flush=True)
     for name in faults:
         others = ", ".join(f"{first or '-'} {count}" for (of, first), count in named.items() if of == name and count)
         print(f"{name or 'no fault':20}{f'{right[name]}/{len(held)}':>8}  {others}")

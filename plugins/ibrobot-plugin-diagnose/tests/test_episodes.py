@@ -92,3 +92,13 @@ def test_joint_that_stands_while_others_move_is_cut_off_only_if_they_go_on(lasts
     commands = np.minimum(np.concatenate(parts), (bound, 9.0))
     accused = "saturated" in {each.name for each in diagnose(make_window(commands), Reference()).findings}
     assert accused == (bound < 1)
+
+
+@pytest.mark.parametrize(("eases", "accused"), [(True, False), (False, True)])
+def test_joint_that_slows_down_before_it_stands_at_its_end_is_not_cut_off(eases, accused):
+    """While another joint goes on, so that the pace of the motion says nothing of it."""
+    at = np.clip(np.arange(120) / 40, 0.0, 1.0)
+    turned = 0.8 * (np.sin(np.pi * at / 2) if eases else at)
+    commands = np.column_stack([turned, 0.02 * np.arange(120)])
+    named = {each.name for each in diagnose(make_window(commands), Reference()).findings}
+    assert ("saturated" in named) == accused

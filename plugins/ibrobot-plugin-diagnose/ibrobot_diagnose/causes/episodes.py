@@ -16,6 +16,8 @@ _SLOW = 0.003
 """Motion between two samples up to which it counts as noise [rad]."""
 _GOES_ON = 0.2
 """Share of its largest speed with which a joint goes on moving; scripted motions have at most 0.04 where they stop."""
+_AT_ONCE = 0.1
+"""Share of its largest speed from which a joint stops or starts at once."""
 
 
 class _Still(CardCause):
@@ -103,7 +105,8 @@ class Saturated(Cause):
         shares = np.zeros(len(window.joints))
         for joint in np.flatnonzero(np.ptp(values, axis=0) >= 0.1):
             for extreme in (values[:, joint].min(), values[:, joint].max()):
-                cut = _cut_off(np.abs(values[:, joint] - extreme) < 1e-4, np.delete(steps, joint, axis=1))
+                still = np.abs(values[:, joint] - extreme) < 1e-4
+                cut = _cut_off(still, steps[:, joint], np.delete(steps, joint, axis=1))
                 shares[joint] = max(shares[joint], (cut[1:] & moving).sum() / max(1, int(moving.sum())))
         # A gripper that is shut stands at its end, too.
         shares = np.array(
@@ -117,18 +120,23 @@ class Saturated(Cause):
         return Evidence(text, 100 * float(shares[j]), "%", 12.0, likelihood(float(shares[j]), 0.12, 0.3))
 
 
-def _cut_off(still: NDArray[np.bool_], others: Floats) -> NDArray[np.bool_]:
+def _cut_off(still: NDArray[np.bool_], own: Floats, others: Floats) -> NDArray[np.bool_]:
     """At which of the times in `still`, at which a joint stands at its extreme, it is cut off; both have shape (T,).
 
-    It is cut off if other joints keep moving (by `others` between two samples) while it stops or starts. In a planned
-    motion that merely ends at the extreme, all joints stop and start together.
+    It is cut off if it stops or starts at once (by `own`, its motion between two samples) while other joints keep
+    moving (by `others`). In a planned motion that merely ends at the extreme, all joints stop and start together; a
+    joint that comes to rest there by itself slows down before.
     """
     pace = (others / np.maximum(others.max(axis=0, initial=0.0), _SLOW)).max(axis=1, initial=0.0)
+    speed = own / max(float(own.max(initial=0.0)), _SLOW)
     edges = np.flatnonzero(np.diff(still.astype(int), prepend=0, append=0))
     cut = np.zeros_like(still)
     for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        near = (pace[max(0, at - 3) : at + 2].min() for at in (begin, end) if 0 < at < len(still))
-        cut[begin:end] = any(least > _GOES_ON for least in near)
+        cut[begin:end] = any(
+            pace[max(0, at - 3) : at + 2].min() > _GOES_ON and beside.max(initial=0.0) > _AT_ONCE
+            for at, beside in ((begin, speed[max(0, begin - 3) : begin]), (end, speed[end - 1 : end + 2]))
+            if 0 < at < len(still)
+        )
     return cut
 
 
