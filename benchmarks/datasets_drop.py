@@ -26,6 +26,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+from figures import report
 from numpy.typing import NDArray
 
 CONFIG = Path(__file__).parents[1] / "configs" / "so101_pick_cube.yaml"
@@ -163,6 +164,7 @@ def main() -> int:
         "successes_checked": successes[1], "mcnemar_p": compared["mcnemar_p"],
     }  # fmt: skip
     print(json.dumps({**result, "verdict": compared["words"]}))
+    report(**result)
     return 0
 
 

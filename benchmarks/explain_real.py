@@ -127,6 +127,7 @@ class Changed(EpisodeReader):
 
     def __init__(self, reader: EpisodeReader, fault: Fault) -> None:
         self._reader, self._fault = reader, fault
+        self.sampled = reader.sampled  # type: ignore[misc]
 
     @override
     def summary(self) -> EpisodeSummary:

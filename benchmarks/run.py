@@ -236,13 +236,21 @@ CLAIMS = (
         "explain_cost",
         "an episode with two cameras at 30 Hz is explained in less time than it lasts, with at most 300 MB",
         "docs/how-to/explain-a-failure.md",
-        "explain_cost.py --episodes 4",
+        "explain_cost.py",
     ),
     Claim(
         "datasets_check",
         "`ibrobot datasets check` lists demonstrations with a planted fault, and seldom a good one",
         "docs/how-to/explain-a-failure.md",
         "datasets_check.py",
+    ),
+    Claim(
+        "datasets_drop",
+        "a small ACT without the demonstrations that `ibrobot datasets check` lists is compared, on the same seeds,"
+        " with one trained on all; which one is better is undecided",
+        "docs/how-to/explain-a-failure.md",
+        "datasets_drop.py --steps 2000 --trials 100",
+        "`lerobot[dataset,training]`",
     ),
     Claim(
         "preflight",

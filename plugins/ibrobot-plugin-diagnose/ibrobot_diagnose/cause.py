@@ -223,6 +223,11 @@ class Diagnosis:
     broken: tuple[tuple[str, str], ...] = ()
     """Those of the untested that have a mistake, and the plugins that failed, which may offer causes."""
 
+    def source_of(self, number: int) -> int | None:
+        """The finding that brings another one about, both by their place; None if it stands for itself."""
+        finding = self.findings[number]
+        return next((i for i, each in enumerate(self.findings[:number]) if each.explains(finding)), None)
+
     @property
     def first(self) -> str:
         """Name of the most probable cause; empty if none is accused."""

@@ -63,7 +63,7 @@ def _blocks(cause: Mapping[str, Any]) -> list[Text | Table | Plots | Cases]:
     since = f", from {cause['since_s']:.1f} s on" if cause["since_s"] is not None else ""
     details = [Text(detail, "note") for detail in cause["details"]]
     likely = Text(f"Likelihood {100 * cause['likelihood']:.0f} %{since} ({cause['name']}).", "note")
-    return [likely, *details, Text("What to do", "title"), Text(cause["remedy"])]
+    return [likely, *details, Text("What to do", "title"), Text(cause.get("to_do") or cause["remedy"])]
 
 
 def lines_of(out: Path) -> Sequence[str]:

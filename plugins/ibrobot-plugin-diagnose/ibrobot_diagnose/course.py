@@ -21,6 +21,8 @@ AT_LIMIT = 0.97
 """Share of a velocity limit from which a command counts as limited."""
 CONFLICT = 0.06
 """Difference between answers for the same time from which they are not the same [rad]."""
+_BEHIND = 0.02
+"""Distance from the plan from which a command has not caught up with it [rad]."""
 _MOVED = 0.05
 """An arm has begun to move when a command is so far from the first one [rad]."""
 
@@ -69,12 +71,27 @@ class Course:
         )
 
     @cached_property
+    def at_limits(self) -> Mapping[str, NDArray[np.bool_]]:
+        """Kind of a limit -> whether it changes the command, each of shape (T, J)."""
+        steps = np.diff(self.command, axis=0, prepend=self.command[:1], append=self.command[-1:])
+        change = np.abs(np.diff(steps, axis=0)) * self.window.contract.rate_hz**2
+        most = np.array([each.acceleration for each in self.window.limits])
+        lead = np.abs(self.command - self.state)
+        changed = np.nan_to_num(np.abs(self.command - self.planned)) > _BEHIND
+        return {
+            "velocity": self.at_velocity, "position": self.at_position,
+            "acceleration": changed & (np.nan_to_num(change) >= AT_LIMIT * most),
+            "lead": changed & (np.nan_to_num(lead) >= AT_LIMIT * self.window.leads),
+        }  # fmt: skip
+
+    @cached_property
     def shares(self) -> Mapping[str, float]:
         """Where the difference between what the newest answer said and where the arm was arose: mean [rad]."""
-        acting = self.acting
+        acting, guarded, changed = self.acting, self._guarded, self.command - self.planned
         parts = {
-            "blending": self.planned - self.wanted, "limits": np.where(self._limited, self.command - self.planned, 0.0),
-            "other changes of the plan": np.where(self._limited, 0.0, self.command - self.planned),
+            "blending": self.planned - self.wanted, "guard": np.where(guarded, changed, 0.0),
+            "limits": np.where(self._limited & ~guarded, changed, 0.0),
+            "other changes of the plan": np.where(self._limited | guarded, 0.0, changed),
             "following": self.state - self.command,
         }  # fmt: skip
         return {name: _mean(np.abs(values[acting])) for name, values in parts.items()}
@@ -82,9 +99,20 @@ class Course:
     @cached_property
     def _limited(self) -> NDArray[np.bool_]:
         """Whether a limit is at work, or the command has not caught up since."""
-        limited = self.at_velocity | self.at_position
-        behind = np.abs(self.command - self.planned) > 0.02
-        result = limited.copy()
+        return self._lasting(np.logical_or.reduce(list(self.at_limits.values())))
+
+    @cached_property
+    def _guarded(self) -> NDArray[np.bool_]:
+        """Whether the guard holds the command back, or it has not caught up since."""
+        times = np.array([since for since, _ in self.window.guarded], np.int64)
+        held = np.array([False, *(bool(label) for _, label in self.window.guarded)])
+        at_work = held[np.searchsorted(times, self.times_ns, side="right")]
+        return self._lasting(np.repeat(at_work[:, None], len(self.window.joints), axis=1))
+
+    def _lasting(self, flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Flags that last until the command has caught up with the plan."""
+        behind = np.abs(self.command - self.planned) > _BEHIND
+        result = flags.copy()
         for row in range(1, len(result)):
             result[row] |= result[row - 1] & behind[row]
         return result
@@ -101,9 +129,13 @@ class Course:
                 "observation_age_ms": round((t_ns - asked.answer.observed_ns) / 1e6, 2),
                 "latency_ms": round(asked.answer.latency_ms, 2), "past_actions": asked.past,
                 "blending_rad": _mean(np.abs(self.planned[i] - self.wanted[i])),
-                "limits_rad": _mean(np.abs((self.command - self.planned)[i]) * self._limited[i]),
+                "limits_rad": _mean(np.abs((self.command - self.planned)[i]) * (self._limited & ~self._guarded)[i]),
                 "following_rad": _mean(np.abs(self.state[i] - self.command[i])),
-                "at_limit": [self.window.joints[j] for j in np.flatnonzero((self.at_velocity | self.at_position)[i])],
+                "guard_rad": _mean(np.abs((self.command - self.planned)[i]) * self._guarded[i]),
+                "at_limit": [
+                    f"{self.window.joints[j]} {kind}"
+                    for kind, flags in self.at_limits.items() for j in np.flatnonzero(flags[i])
+                ],
             }  # fmt: skip
             rows.append(row)
         return rows

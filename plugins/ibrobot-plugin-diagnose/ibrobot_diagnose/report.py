@@ -50,12 +50,27 @@ class Explanation:
             "was found, so the model got what it was trained on and the arm did what it said."
         )
 
+    def to_do(self, number: int) -> str:
+        """What to do about a finding: its remedy, but first what brings it about."""
+        findings = self.diagnosis.findings
+        remedy = findings[number].cause.remedy
+        if (source := self.diagnosis.source_of(number)) is not None:
+            first = "what the first line says" if not source else f"number {source + 1}"
+            return f"First mend {first}: this is probably a consequence of it."
+        if number and findings[number].cause.weak and not findings[0].cause.weak:
+            return (
+                f"First mend what the first line says. If the policy still errs then: {remedy[0].lower()}{remedy[1:]}"
+            )
+        return remedy
+
     def facts(self, *, ticks: bool = False) -> dict[str, Any]:
         """The explanation as a JSON object."""
         diagnosis, window = self.diagnosis, self.window
         return {
             "episode": window.name, "outcome": window.outcome, "seconds": round(window.seconds, 3), "first": self.first,
-            "causes": [finding_facts(each) for each in diagnosis.findings],
+            "causes": [
+                {**finding_facts(each), "to_do": self.to_do(number)} for number, each in enumerate(diagnosis.findings)
+            ],
             "healthy": [{"name": name, "text": title} for name, title in diagnosis.healthy],
             "untested": [{"name": name, "why": why} for name, why in diagnosis.untested],
             "between": between(window, self.course), **self._model_facts(),
@@ -102,7 +117,7 @@ class Explanation:
             since = f", from {evidence.since_s:.1f} s on" if evidence.since_s is not None else ""
             lines += [f"   likelihood {100 * evidence.likelihood:.0f} %{since} ({each.name})"]
             lines += [f"   {detail}" for detail in evidence.details]
-            lines += [f"   What to do: {each.cause.remedy}"]
+            lines += [f"   What to do: {self.to_do(number)}"]
         lines += ["", *self.lines_between()]
         if diagnosis.healthy:
             lines += [f"Tested and healthy: {'; '.join(title for _, title in diagnosis.healthy)}."]
@@ -143,11 +158,12 @@ def between(window: Window, course: Course | None) -> Mapping[str, Any]:
         facts["chunk_actions"] = round(float(np.mean([len(each.chunk) for each in used])), 2)
         facts["step_ms"] = round(float(np.median([each.answer.step_ns for each in used])) / 1e6, 3)
     if course is not None:
-        at_limit = (course.at_velocity | course.at_position).any(axis=1)
         facts |= {
             "share_held": round(float((course.dry & ~course.operated).mean()), 4),
             "share_operated": round(float(course.operated.mean()), 4),
-            "share_at_limit": round(float(at_limit.mean()), 4),
+            "share_at_limit": {
+                name: round(float(flags.any(axis=1).mean()), 4) for name, flags in course.at_limits.items()
+            },
             "mean_difference_rad": {name: round(value, 5) for name, value in course.shares.items()},
         }
     gaps = np.diff(window.command.times_ns) / 1e6
@@ -171,9 +187,10 @@ def between_lines(window: Window, course: Course | None) -> list[str]:
         shares = facts["mean_difference_rad"]
         total = sum(shares.values()) or 1.0
         parts = ", ".join(f"{name} {value:.4f} rad ({100 * value / total:.0f} %)" for name, value in shares.items())
+        limits = ", ".join(f"{name} {100 * share:.1f} %" for name, share in facts["share_at_limit"].items() if share)
         lines.append(
             f"Mean difference from the newest answer to the arm: {parts}. Held without a plan "
-            f"{100 * facts['share_held']:.1f} % of the time, operated {100 * facts['share_operated']:.1f} %, at a "
-            f"limit {100 * facts['share_at_limit']:.1f} %."
+            f"{100 * facts['share_held']:.1f} % of the time, operated {100 * facts['share_operated']:.1f} %; at a "
+            f"limit: {limits or 'never'}."
         )
     return lines

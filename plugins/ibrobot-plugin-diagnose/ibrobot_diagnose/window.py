@@ -293,14 +293,30 @@ class Window:
     @cached_property
     def limits(self) -> tuple[Limits, ...]:
         """The limits of the joints, as the robot YAML states them."""
+        return tuple(map(_limits, self._described))
+
+    @cached_property
+    def leads(self) -> Floats:
+        """How far commands may be from the measured positions [rad], shape (J,); infinite where no YAML says it."""
+        stated = (each.get("max_lead") for each in self._described)
+        return np.array([float(each) if isinstance(each, int | float) else np.inf for each in stated])
+
+    @cached_property
+    def _described(self) -> Sequence[Mapping[str, Any]]:
+        """What the robot YAML says of each joint; nothing of one that it does not have."""
         known = {str(each.get("name")): each for each in (self.document.get("robot") or {}).get("joints") or ()}
-        return tuple(_limits(known.get(joint, {})) for joint in self.joints)
+        return [known.get(joint, {}) for joint in self.joints]
 
     def commander_at(self, t_ns: Times) -> list[str]:
         """Who commanded at these times; empty if it is unknown."""
         times = [since for since, _ in self.commanders]
         index = np.searchsorted(np.array(times, np.int64), t_ns, side="right") - 1
         return [self.commanders[i][1] if i >= 0 else "" for i in index]
+
+
+def grips(joint: str) -> bool:
+    """Whether a joint is one of a gripper or a hand, by its name."""
+    return any(part in joint.lower() for part in ("grip", "jaw", "hand", "finger", "thumb"))
 
 
 def _object(metadata: Mapping[str, str], key: str, name: str) -> Mapping[str, Any]:

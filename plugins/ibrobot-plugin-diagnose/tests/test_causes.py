@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,15 @@ from ibrobot_diagnose.cause import KIND, OWN_NAMES, Cause, CauseDescriptor, Evid
 from ibrobot_diagnose.causes import all_causes
 from ibrobot_diagnose.causes.data import UnseenStates
 from ibrobot_diagnose.causes.motion import AnswersTremble, SmoothingAverages
+from ibrobot_diagnose.causes.others import TOOLS
 from ibrobot_diagnose.commands import check
 from ibrobot_diagnose.diagnosis import diagnose
 from ibrobot_diagnose.report import Explanation
 from ibrobot_diagnose.testing import Answer, make_window
+from ibrobot_diagnose.window import Window
 from made_runs import Run, window_of
 from numpy.typing import NDArray
-from planted_faults import JOINTS, PICTURES, TIMES, of_top
+from planted_faults import DEMONSTRATED, JOINTS, PICTURES, TIMES, of_top
 
 from ibrobot_core.api import Late, Options, option
 from ibrobot_core.plugins import Entry, Failure, Registry
@@ -49,12 +52,24 @@ def first_of(run: Run, reference: Reference) -> str:
     return diagnose(window_of(run), reference).first
 
 
+def explained_by(window: Window, reference: Reference) -> str:
+    """The cause that is named first, if it brings about all others that are found, but for those of a weak policy."""
+    found = diagnose(window, reference).findings
+    followed = {0}
+    for number, each in enumerate(found):
+        if any(found[source].explains(each) for source in followed if source < number):
+            followed.add(number)
+    others = [each.name for number, each in enumerate(found) if number not in followed and not each.cause.weak]
+    return f"{found[0].name}, but also {others}" if others else found[0].name
+
+
 @pytest.mark.parametrize("cause", TIMES)
 def test_planted_fault_is_named_first(cause):
     mild, _, strong = (
         Run(seed=9000 + number, cameras=(), outcome="failure", **each) for number, each in enumerate(TIMES[cause])
     )
-    assert [first_of(each, Reference()) for each in (mild, strong)] == [cause] * 2
+    assert first_of(mild, Reference()) == cause
+    assert explained_by(window_of(strong), Reference()) == cause
 
 
 @pytest.mark.parametrize("cause", [*PICTURES, *JOINTS])
@@ -64,9 +79,76 @@ def test_planted_fault_is_named_first_with_the_data(cause, data):
         Run(**{**SHOWN[cause], "seed": 9010 + number, "outcome": "failure", **each})
         for number, each in enumerate(planted[cause])
     )
-    assert first_of(strong, data) == cause
+    assert explained_by(window_of(strong), data) == cause
     if planted[cause][0] is not planted[cause][2]:
         assert first_of(mild, data) in (cause, ""), "a mild fault may be missed, but accuses no other cause"
+
+
+def changed(reference: Reference, **facts: Any) -> Reference:
+    """The reference with another card."""
+    assert reference.card is not None
+    return Reference(attrs.evolve(reference.card, **facts))
+
+
+def idle_data(data: Reference) -> tuple[Window, Reference]:
+    """Demonstrations that begin with 3 s in which nothing moves, and a policy that has learned to wait."""
+    demos = (Run(seed=each, acts=False, seconds=10, cameras=(), idle_s=3.0) for each in range(10))
+    run = Run(seed=9501, outcome="failure", cameras=(), idle_s=5.5, seconds=9)
+    return window_of(run), Reference(make_card(map(window_of, demos)))
+
+
+def other_norm_mode(data: Reference) -> tuple[Window, Reference]:
+    """A robot YAML that gives the model degrees."""
+    window = plain_run()
+    document = json.dumps({**window.document, "models": {"act": {"norm_mode": "degrees"}}})
+    metadata = {**window.metadata, "config": document}
+    return attrs.evolve(window, metadata=metadata), changed(data, norm_mode="radians")
+
+
+@cache
+def plain_run() -> Window:
+    return window_of(Run(seed=9500, outcome="failure", **NONE))
+
+
+OF_THE_DATA: dict[str, Callable[[Reference], tuple[Window, Reference]]] = {
+    "other_rate": lambda data: (plain_run(), changed(data, rate_hz=15.0)),
+    "checkpoint_early": lambda data: (plain_run(), changed(data, trained={"step": 20, "steps": 20, "batch_size": 8})),
+    "idle_data": idle_data,
+    "other_norm_mode": other_norm_mode,
+}
+"""Cause -> a run and its model's data, which only this cause explains."""
+ELSEWHERE = {
+    "other_model": "tests/lerobot/test_ask_again.py", "camera_ignored": "tests/lerobot/test_ask_again.py",
+    "answers_tremble": "test_answers_of_noise_are_a_weak_policy",
+    "unseen_states": "test_arm_that_leaves_the_data_for_no_other_reason_is_a_weak_policy",
+    "unseen_success": "test_a_success_judged_a_failure_held_something_and_ends_as_the_data_does",
+    "unseen_pictures": "test_scene_that_the_data_does_not_have_is_named",
+}  # fmt: skip
+"""Cause -> where its planted case is."""
+
+
+@pytest.mark.parametrize("cause", OF_THE_DATA)
+def test_planted_fault_of_the_data_is_named_first(cause, data):
+    assert explained_by(*OF_THE_DATA[cause](data)) == cause
+
+
+def test_scene_that_the_data_does_not_have_is_named(data):
+    """Something else lies on the table."""
+
+    def other(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        shown = picture.copy()
+        shown[8:64:12], shown[:, 8:90:12] = (20, 160, 60), (200, 200, 30)
+        return shown
+
+    run = Run(seed=9520, outcome="failure", picture=of_top(other), **ONE)
+    assert "unseen_pictures" in {each.name for each in diagnose(window_of(run), data).findings}
+
+
+def test_every_cause_of_a_run_or_an_episode_has_a_planted_case():
+    of_rigs = {each.name for each in all_causes() if "rig" in each.needs}
+    tools = {each.name for each in TOOLS}
+    planted = {*TIMES, *PICTURES, *JOINTS, *OF_THE_DATA, *ELSEWHERE, *DEMONSTRATED, "odd_length", "odd_path"}
+    assert {each.name for each in all_causes()} - of_rigs - tools == planted
 
 
 def test_healthy_runs_accuse_nobody():
@@ -521,3 +603,31 @@ def test_check_of_a_dataset_names_a_cause_with_a_mistake(monkeypatch, data):
     lines = check.lines_of({"episodes": 2, "listed": [], "counts": {}, "untested": untested})
     assert lines[0].startswith("Not tested in 1 of 2 episodes: squeaks, since ibrobot-plugin-squeaks has a mistake: ")
     assert lines[-1] == "All 2 episodes are like one another: nothing was found."
+
+
+def test_what_the_first_cause_brings_about_is_mended_by_mending_that(data):
+    run = Run(seed=9400, outcome="failure", guarded=(0.1, 0.9), **NONE, **JOINTS["gripper_reversed"][2])
+    window = window_of(run)
+    explanation = Explanation.of(window, data, diagnose(window, data))
+    done = {each["name"]: each["to_do"] for each in explanation.facts()["causes"]}
+    assert next(iter(done)) == "gripper_reversed"
+    assert done["gripper_reversed"].startswith("Reverse the gripper")
+    assert done["guard_held"] == "First mend what the first line says: this is probably a consequence of it."
+    assert f"   What to do: {done['guard_held']}" in explanation.lines()
+
+
+@pytest.mark.parametrize(
+    ("options", "part"),
+    [
+        ({"guarded": (0.3, 0.7)}, "guard"),
+        ({"velocity": 0.2}, "limits"),
+        ({"torn": 0.6}, "blending"),
+        ({"gain": {0: 0.2}}, "following"),
+    ],
+)
+def test_what_parts_the_arm_from_the_answers_has_the_largest_share(options, part):
+    window = window_of(Run(seed=9410, cameras=(), **options))
+    explanation = Explanation.of(window, Reference(), diagnose(window, Reference()))
+    shares = explanation.facts()["between"]["mean_difference_rad"]
+    assert max(shares, key=lambda each: shares[each]) == part
+    assert (explanation.facts()["between"]["share_at_limit"]["velocity"] > 0.5) == (part == "limits")

@@ -11,7 +11,7 @@ from ibrobot_diagnose.card import Card, moving_speed, speed_of
 from ibrobot_diagnose.cause import CardCause, Cause, Evidence, likelihood
 from ibrobot_diagnose.causes.pictures import pairs
 from ibrobot_diagnose.course import begins_to_move
-from ibrobot_diagnose.window import Times, Window
+from ibrobot_diagnose.window import Times, Window, grips
 
 
 class OtherPrompt(CardCause):
@@ -34,7 +34,8 @@ class OtherPrompt(CardCause):
             return None
         asked = any(each.answer.prompt for each in window.asked)
         shown = "; ".join(repr(text) for text in known[:3])
-        text = f"The task is {window.prompt!r}, which is none of the {len(known)} of the data: {shown}."
+        of_data = f"none of the {len(known)} tasks" if len(known) > 1 else "not the task"
+        text = f"The task is {window.prompt!r}, {of_data} of the data: {shown}."
         like = {_plain(text) for text in known}
         return Evidence(text, 1.0, "tasks", 0.5, 0.6 if not asked or _plain(window.prompt) in like else 0.9)
 
@@ -143,8 +144,8 @@ class OtherSpeed(CardCause):
         factor = low / arm if slow else max(arm, model) / high
         who = "The arm moves" if slow or arm >= model else "The model's answers move the arm"
         text = (
-            f"{who} too {'slow' if slow else 'fast'}: {arm if slow else max(arm, model):.2f} rad/s over all joints, in "
-            f"the data {low:.2f} to {high:.2f}."
+            f"{who} too {'slowly' if slow else 'fast'}: {arm if slow else max(arm, model):.2f} rad/s over all joints, "
+            f"in the data {low:.2f} to {high:.2f}."
         )
         return Evidence(
             text, factor, "times", 1.45, likelihood(factor, 1.45, 2.2), explains=frozenset() if slow else None,
@@ -339,7 +340,7 @@ def _handled(window: Window, card: Card) -> bool:
 
     A gripper that holds something does not reach its command.
     """
-    for j in (i for i, joint in enumerate(card.joints) if "grip" in joint or "jaw" in joint):
+    for j in (i for i, joint in enumerate(card.joints) if grips(joint)):
         usual = float(card.row(card.lead, 0.95)[j])
         if usual < _GAP:
             continue

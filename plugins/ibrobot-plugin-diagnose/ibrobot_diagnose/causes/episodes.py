@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ibrobot_diagnose.card import Card, jerk_of, rests_of, series_of, way_of
 from ibrobot_diagnose.cause import CardCause, Cause, Evidence, Reference, likelihood
-from ibrobot_diagnose.window import Floats, Window
+from ibrobot_diagnose.window import Floats, Window, grips
 
 _SHOWN = frozenset({"demonstration", "state"})
 _SLOW = 0.003
@@ -109,9 +109,7 @@ class Saturated(Cause):
                 cut = _cut_off(still, steps[:, joint], np.delete(steps, joint, axis=1))
                 shares[joint] = max(shares[joint], (cut[1:] & moving).sum() / max(1, int(moving.sum())))
         # A gripper that is shut stands at its end, too.
-        shares = np.array(
-            [0.0 if "grip" in joint else share for joint, share in zip(window.joints, shares, strict=True)]
-        )
+        shares = np.array([0.0 if grips(joint) else share for joint, share in zip(window.joints, shares, strict=True)])
         j = int(np.argmax(shares))
         text = (
             f"{window.joints[j]} stands at the end of its range for {100 * shares[j]:.0f} % of the motion: it is cut "
@@ -196,7 +194,7 @@ class GripperIdle(CardCause):
 
     @override
     def compare(self, window: Window, card: Card) -> Evidence | None:
-        grippers = [j for j, joint in enumerate(window.joints) if "grip" in joint or "jaw" in joint]
+        grippers = [j for j, joint in enumerate(window.joints) if grips(joint)]
         known = window.states[np.isfinite(window.states).all(axis=1)]
         usual = card.row(card.state, 0.95) - card.row(card.state, 0.05)
         grippers = [j for j in grippers if usual[j] > 0.15]

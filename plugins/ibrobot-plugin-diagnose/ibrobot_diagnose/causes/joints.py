@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ibrobot_diagnose.card import LEVELS, Card
 from ibrobot_diagnose.cause import CardCause, Cause, Evidence, Reference, likelihood
-from ibrobot_diagnose.causes.pictures import pairs
+from ibrobot_diagnose.causes.pictures import Pair, pairs
 from ibrobot_diagnose.pictures import descriptors, nearest
-from ibrobot_diagnose.window import Floats, Window
+from ibrobot_diagnose.window import Floats, Window, grips
 
 _MIDDLE = slice(1, -1)
 """Levels of the quantiles that are compared."""
@@ -48,11 +48,16 @@ def _costs(states: Floats, card: Card) -> NDArray[np.float64]:
     return result
 
 
+def _repeats(pair: Pair) -> bool:
+    """Whether pictures of a camera repeat, so that they say something of the pose."""
+    return pair.card.usual_distance <= _REPEATS
+
+
 def nearest_poses(window: Window, card: Card) -> tuple[Floats, Floats]:
     """Positions of the joints in the window, and those of the data at pictures that look the same; shape (N, J)."""
     own, theirs = [], []
     for pair in pairs(window, card):
-        if pair.card.usual_distance > _REPEATS:
+        if not _repeats(pair):
             continue
         times = np.array(pair.camera.times_ns, np.int64)
         index = np.unique(np.linspace(0, len(times) - 1, min(120, len(times))).round().astype(int))
@@ -207,7 +212,10 @@ class JointOrder(CardCause):
         pairs_of = [f"{window.joints[i]} behaves as {card.joints[j]}" for i, j in enumerate(order) if i != j]
         if not pairs_of or len(pairs_of) < 2:
             return None
-        text = f"Joints are exchanged: {', '.join(pairs_of)} in the data; so they fit {ratio:.1f} times as well."
+        text = (
+            f"Joints are exchanged: {', '.join(pairs_of)} in the data; exchanged back, they fit the data {ratio:.1f} "
+            "times as well."
+        )
         return Evidence(text, ratio, "times", 1.8, likelihood(ratio, 1.8, 3.0))
 
 
@@ -280,12 +288,19 @@ class JointZero(CardCause):
         start = float(_known(window)[0, j] - np.median(card.starts[:, j]))
         if abs(start - middle[j]) < 0.5 * abs(middle[j]):  # an arm that begins in its rest pose is off by as much
             number *= 1.5
-        return Evidence(text, number, "times", 2.0, likelihood(number, 2.0, 3.5), details=details)
+        likely = likelihood(number, 2.0, 3.5)
+        shown = next((each.beside() for each in pairs(window, card) if _repeats(each)), ()) if likely > 0.4 else ()
+        return Evidence(text, number, "times", 2.0, likely, details=details, pictures=shown)
 
 
 def _gripper(window: Window) -> int | None:
-    names = [i for i, joint in enumerate(window.joints) if "grip" in joint or "jaw" in joint]
+    names = [i for i, joint in enumerate(window.joints) if grips(joint)]
     return names[0] if len(names) == 1 else None
+
+
+def _plain(angle: float) -> str:
+    """An angle with two digits, and no sign if these are zero."""
+    return f"{round(angle, 2) + 0.0:.2f}"
 
 
 class GripperScaled(CardCause):
@@ -294,7 +309,7 @@ class GripperScaled(CardCause):
     name = "gripper_scaled"
     title = "the gripper has the range of the data"
     needs = frozenset({"motion", "state", "card"})
-    explains = frozenset({"unseen_states", "unseen_start", "arm_not_following"})
+    explains = frozenset({"unseen_states", "unseen_start", "arm_not_following", "guard_held"})
     remedy = "Calibrate the gripper from shut to open; a percentage is no angle, and another jaw has another range."
 
     @override
@@ -311,7 +326,10 @@ class GripperScaled(CardCause):
         start = float(np.median(card.starts[:, j]))
         if abs(own[0] - start) > 0.4 * max(high - low, 0.05) and abs(own[0] - reach * start) > 0.3 * reach * abs(start):
             reach = 1.0  # it begins where no factor brings it
-        text = f"The gripper reaches from {begin:.2f} to {end:.2f}; in the data from {low:.2f} to {high:.2f} rad."
+        text = (
+            f"The gripper reaches from {_plain(begin)} to {_plain(end)} rad; in the data from {_plain(low)} to "
+            f"{_plain(high)} rad."
+        )
         return Evidence(text, reach, "times", 1.5, likelihood(reach, 1.5, 2.2))
 
 

@@ -99,7 +99,7 @@ class GuardHeld(Cause):
         pairs = sorted(held, key=lambda each: -held[each])
         text = f"The guard held the arm back in {100 * share:.0f} % of the run, mostly between {pairs[0]}."
         first_ns = next(since for since, label in window.guarded if label)
-        details = tuple(f"{pair}: {held[pair] / NS_PER_S:.1f} s" for pair in pairs[:5])
+        details = tuple(f"{pair}: {held[pair] / NS_PER_S:.1f} s" for pair in pairs[:5] if held[pair] >= NS_PER_S / 20)
         return Evidence(text, 100 * share, "%", 10.0, likelihood(share, 0.1, 0.2), window.since(first_ns), details)
 
 

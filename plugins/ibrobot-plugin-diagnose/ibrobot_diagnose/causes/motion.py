@@ -8,7 +8,7 @@ import numpy as np
 
 from ibrobot_diagnose.cause import Cause, Evidence, Reference, likelihood
 from ibrobot_diagnose.course import CONFLICT, begins_to_move, chance_of_noise, conflict_of, course_of, delay_of
-from ibrobot_diagnose.window import Floats, Window
+from ibrobot_diagnose.window import Floats, Window, grips
 
 
 class ArmNotFollowing(Cause):
@@ -27,7 +27,7 @@ class ArmNotFollowing(Cause):
     def test(self, window: Window, reference: Reference) -> Evidence | None:
         delays, rests = delay_of(window)
         ranges, asked = _ranges(window.states), _ranges(window.commands)
-        for gripper in (i for i, joint in enumerate(window.joints) if "grip" in joint or "jaw" in joint):
+        for gripper in (i for i, joint in enumerate(window.joints) if grips(joint)):
             if ranges[gripper] > 0.1 * asked[gripper]:  # it holds something
                 rests[gripper] = np.nan
         if not np.isfinite(rests).any():
@@ -145,8 +145,8 @@ class AnswersTremble(Cause):
         "guard_held",  # such answers lead into the table
     })  # fmt: skip
     remedy = (
-        "Train longer, on more data; for a diffusion policy look at its denoising steps, too. Nothing of the robot "
-        "makes answers like these."
+        "Train longer, on more data; for a diffusion policy look at its denoising steps, too. Nothing of the arm makes "
+        "answers like these; pictures that the model has never seen may."
     )
 
     @override

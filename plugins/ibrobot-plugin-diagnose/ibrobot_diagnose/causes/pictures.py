@@ -256,11 +256,11 @@ class _Level(PictureCause):
         if self.number == "brightness" and self.above:  # a bright scene cannot become much brighter: it turns white
             white = float(np.median(numbers_of(pair.camera)["clipped"])) - pair.card.at("clipped", 0.95)
             ratio = max(ratio, 1.0 + white)
-        text = (
-            f"The pictures of {pair.camera.name} are too {self.words}: their {self.number} is {value:.3g}; in the data "
-            f"it is {low:.3g} to {high:.3g}."
-        )
-        return ratio, text
+        return ratio, f"The pictures of {pair.camera.name} are too {self.words}: {self.compared(value, low, high)}."
+
+    def compared(self, value: float, low: float, high: float) -> str:
+        """The number, and its range in the data, in words."""
+        return f"their {self.number} is {value:.0f} of 255; in the data it is {low:.0f} to {high:.0f}"
 
 
 class PictureDark(_Level):
@@ -299,6 +299,10 @@ class PictureBlurred(_Level):
 
     name, title, number, words = "picture_blurred", "pictures are as sharp as in the data", "sharpness", "blurred"
     threshold, certain = 1.35, 2.2
+
+    @override
+    def compared(self, value: float, low: float, high: float) -> str:
+        return f"their details have {100 * value / max(low, 1e-3):.0f} % of the contrast that they have in the data"
 
     @override
     def see(self, name: str, looks: Looks) -> tuple[float, str] | None:

@@ -13,7 +13,7 @@ from ibrobot_diagnose.card import Card
 from ibrobot_diagnose.cause import CardCause, Cause, Evidence, Reference, likelihood
 from ibrobot_diagnose.causes.moved import Sight, sights
 from ibrobot_diagnose.rig import Rig, RigCamera
-from ibrobot_diagnose.window import Limits, Window
+from ibrobot_diagnose.window import Limits, Window, grips
 
 _OF_RIG = frozenset({"rig", "rig card"})
 _DEGREES_PER_TICK = 360.0 / 4096
@@ -288,7 +288,7 @@ class OtherGripper(RigCause):
         for name, joints in then.calibration.items():
             for joint, old in joints.items():
                 new = now.calibration.get(name, {}).get(joint)
-                if ("grip" in joint or "jaw" in joint) and new is not None:
+                if grips(joint) and new is not None:
                     own, known = (float(each["range_max"]) - float(each["range_min"]) for each in (new, old))
                     off = 100 * abs(own / known - 1) if known else 0.0
                     text = f"{joint} has a range of {own:.0f} ticks, in the reference {known:.0f}."

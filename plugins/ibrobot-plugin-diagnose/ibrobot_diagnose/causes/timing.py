@@ -69,7 +69,7 @@ class AnswersSlow(Cause):
     name = "answers_slow"
     title = "the model answers in time"
     needs = frozenset({"answers"})
-    explains = frozenset({"plan_dry", "stands_still"})
+    explains = frozenset({"plan_dry", "stands_still", "limits_low"})  # each chunk begins away from where the arm is
     remedy = (
         "Make the model faster (a GPU, fewer denoising steps, `ibrobot export --to onnx`, smaller pictures), or let it "
         "answer with longer chunks; `dispatch: {watermark: auto}` asks early enough if the plan is long enough."
@@ -85,10 +85,11 @@ class AnswersSlow(Cause):
         share, latency = float(np.median(shares)), float(np.median(latencies))
         chunk_ms = float(np.median([len(each.chunk) * each.answer.step_ns / 1e6 for each in used]))
         late = sum(each.answer.outcome == "late" for each in used)
-        text = (
-            f"The model needed {latency:.0f} ms for an answer, {100 * share:.0f} % of the {chunk_ms:.0f} ms that a "
-            "chunk lasts: that part of each answer is past when it comes."
-        )
+        if share < 1:
+            what = f"{100 * share:.0f} % of each chunk, which lasts {chunk_ms:.0f} ms, is past when it comes"
+        else:
+            what = f"a chunk lasts {chunk_ms:.0f} ms, so that all of it is past when it comes"
+        text = f"The model needed {latency:.0f} ms for an answer: {what}."
         details = [f"slowest answer: {latencies.max():.0f} ms"]
         if late:
             details.append(f"{_of(late, len(used), 'answers')} came after their whole chunk was past")
