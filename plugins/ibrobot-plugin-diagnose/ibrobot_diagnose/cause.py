@@ -234,6 +234,11 @@ class Diagnosis:
         return self.findings[0].name if self.findings else ""
 
 
+def in_digits(angle: float) -> str:
+    """An angle with two digits, and no sign if these are zero."""
+    return f"{round(float(angle), 2) + 0.0:.2f}"
+
+
 _SLOPE = math.log(0.95 / 0.05)
 
 

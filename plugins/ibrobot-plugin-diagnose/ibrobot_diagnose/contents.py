@@ -24,6 +24,8 @@ from ibrobot_diagnose.window import Floats
 
 _WIDTH, _HEIGHT = 360, 190
 _POINTS = 240
+_SPAN = 0.05
+"""Least range of the angles of a plot [rad]."""
 
 _PLAYER = """<script>
 for (const player of document.querySelectorAll(".player")) {
@@ -41,7 +43,7 @@ def contents_of(facts: Mapping[str, Any], plots: Sequence[str], episode: Path | 
     blocks: list[Text | Table | Plots | Cases] = [Text(facts["first"], "verdict")]
     if first is not None:
         blocks += _blocks(first)
-    title = f"{facts['episode']}: {facts['outcome']}"
+    title = f"{Path(facts['episode']).name}: {facts['outcome']}"
     blocks.append(Cases((Case("The recording", f"{facts['seconds']:.1f} s", episode),)))
     sections = [ReportSection(title, tuple(blocks))]
     for number, cause in enumerate(others, 2):
@@ -152,7 +154,9 @@ def _plots(explanation: Explanation) -> Iterator[str]:
         if len(known) < 2 or len(at_s) < 2:
             continue
         across = axis_of([float(at_s[0]), float(at_s[-1])], 44, _WIDTH - 8)
-        down = axis_of([float(known.min()), float(known.max())], _HEIGHT - 36, 24)
+        low, high = float(known.min()), float(known.max())
+        room = max(0.0, _SPAN - (high - low)) / 2  # an arm that stands still is no motion of micrometres
+        down = axis_of([low - room, high + room], _HEIGHT - 36, 24)
         parts = [*grid_below(across, 24, _HEIGHT - 36, "s"), *grid_beside(down, 44, _WIDTH - 8)]
         parts.append(caption(44, 14, f"{joint} [rad]", "start"))
         classes = {"state": "range", "command": "estimate", "answer": "margin"}

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_diagnose.card import Card, moving_speed, speed_of
-from ibrobot_diagnose.cause import CardCause, Cause, Evidence, likelihood
+from ibrobot_diagnose.cause import CardCause, Cause, Evidence, in_digits, likelihood
 from ibrobot_diagnose.causes.pictures import pairs
 from ibrobot_diagnose.course import begins_to_move
 from ibrobot_diagnose.window import Times, Window, grips
@@ -69,7 +69,7 @@ class UnseenStart(CardCause):
         off = np.maximum(np.maximum(low - room - start, start - high - room), 0.0)
         j = int(np.argmax(off))
         text = (
-            f"{window.joints[j]} begins at {start[j]:.2f} rad, {off[j]:.2f} rad outside of the {card.episodes} "
+            f"{window.joints[j]} begins at {in_digits(start[j])} rad, {off[j]:.2f} rad outside of the {card.episodes} "
             "demonstrations, "
             f"which begin from {low[j]:.2f} to {high[j]:.2f} rad."
         )
@@ -116,8 +116,8 @@ class UnseenStates(CardCause):
         j = int(outside.sum(axis=0).argmax())
         since = window.since(int(window.ticks_ns[outside.any(axis=1).argmax()]))
         text = (
-            f"{window.joints[j]} left the range of the data ({low[j]:.2f} to {high[j]:.2f} rad) from {since:.1f} s on; "
-            f"the arm was outside in {100 * share:.0f} % of the run."
+            f"{window.joints[j]} left the range of the data ({in_digits(low[j])} to {in_digits(high[j])} rad) from "
+            f"{since:.1f} s on; the arm was outside in {100 * share:.0f} % of the run."
         )
         return Evidence(text, 100 * share, "%", 15.0, likelihood(share, 0.15, 0.6), since)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_diagnose.card import LEVELS, Card
-from ibrobot_diagnose.cause import CardCause, Cause, Evidence, Reference, likelihood
+from ibrobot_diagnose.cause import CardCause, Cause, Evidence, Reference, in_digits, likelihood
 from ibrobot_diagnose.causes.pictures import Pair, pairs
 from ibrobot_diagnose.pictures import descriptors, nearest
 from ibrobot_diagnose.window import Floats, Window, grips
@@ -257,8 +257,7 @@ class JointZero(CardCause):
     explains = frozenset({"unseen_start", "unseen_states"})
     remedy = (
         "Calibrate the arm again, or choose its own calibration (`hardware: {calibration: …}`): put it into the pose "
-        "of the "
-        "two pictures, and compare the numbers."
+        "of the two pictures of the report (`--out`), and compare the numbers."
     )
 
     @override
@@ -298,11 +297,6 @@ def _gripper(window: Window) -> int | None:
     return names[0] if len(names) == 1 else None
 
 
-def _plain(angle: float) -> str:
-    """An angle with two digits, and no sign if these are zero."""
-    return f"{round(angle, 2) + 0.0:.2f}"
-
-
 class GripperScaled(CardCause):
     """The gripper has another range."""
 
@@ -327,8 +321,8 @@ class GripperScaled(CardCause):
         if abs(own[0] - start) > 0.4 * max(high - low, 0.05) and abs(own[0] - reach * start) > 0.3 * reach * abs(start):
             reach = 1.0  # it begins where no factor brings it
         text = (
-            f"The gripper reaches from {_plain(begin)} to {_plain(end)} rad; in the data from {_plain(low)} to "
-            f"{_plain(high)} rad."
+            f"The gripper reaches from {in_digits(begin)} to {in_digits(end)} rad; in the data from {in_digits(low)} "
+            f"to {in_digits(high)} rad."
         )
         return Evidence(text, reach, "times", 1.5, likelihood(reach, 1.5, 2.2))
 
@@ -340,7 +334,9 @@ class GripperReversed(CardCause):
     title = "open is open, and shut is shut"
     needs = frozenset({"motion", "state", "card"})
     explains = _CONSEQUENCES | {"joint_zero", "joint_order"}
-    remedy = "Reverse the gripper: its sign in the calibration, or its two ends, are exchanged."
+    remedy = (
+        "Calibrate the gripper again, with its ends and its sign as in the recordings: now open and shut are exchanged."
+    )
 
     @override
     def compare(self, window: Window, card: Card) -> Evidence | None:
