@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from ibrobot_diagnose.card import Card, moving_speed, speed_of
 from ibrobot_diagnose.cause import CardCause, Cause, Evidence, in_digits, likelihood
-from ibrobot_diagnose.causes.pictures import pairs
+from ibrobot_diagnose.causes.pictures import Pair, pairs
 from ibrobot_diagnose.course import begins_to_move
+from ibrobot_diagnose.pictures import Shown
 from ibrobot_diagnose.window import Times, Window, grips
 
 
@@ -276,16 +277,15 @@ class UnseenSuccess(CardCause):
     title = "the judgement agrees with the pictures"
     needs = frozenset({"outcome", "pictures", "card pictures"})
     remedy = (
-        "Look at the last pictures: if the task was done, the judge is wrong (a threshold of the scene, an operator's "
-        "key): "
-        "`ibrobot episodes mark EPISODE success`."
+        "Look at the pictures at that time: if the task was done, the judge is wrong (a threshold of the scene, an "
+        "operator's key): `ibrobot episodes mark EPISODE success`."
     )
 
     @override
     def compare(self, window: Window, card: Card) -> Evidence | None:
         if window.outcome != "failure" or window.joints != card.joints:
             return None
-        best: tuple[float, str, float] | None = None
+        best: tuple[float, Pair, int, int] | None = None
         for pair in pairs(window, card):
             owners = [name for name, _ in pair.card.places]
             firsts = [i for i, name in enumerate(owners) if not i or owners[i - 1] != name]
@@ -308,15 +308,21 @@ class UnseenSuccess(CardCause):
                 i = int(np.argmax(np.where(ended, along, -np.inf)))
                 score = float(np.median(along[ended & (np.abs(np.arange(len(along)) - i) < _BESIDE)]))
                 if best is None or score > best[0]:
-                    best = score, pair.camera.name, window.since(pair.camera.times_ns[i])
+                    best = score, pair, i, lasts[0]
         if best is None or not _handled(window, card):
             return None
-        score, name, at_s = best
+        score, pair, i, last = best
+        camera, at_s = pair.camera, window.since(pair.camera.times_ns[i])
         text = (
-            f"At {at_s:.1f} s the arm stands, and the pictures of {name} look, as at the ends of successful episodes "
-            f"({100 * score:.0f} % of the way from their beginnings), but the run was judged a failure."
+            f"The run was judged a failure, but at {at_s:.1f} s the arm stands as at the ends of successful episodes, "
+            f"and {camera.name} sees what it saw there ({100 * score:.0f} % of the way from their beginnings)."
         )
-        return Evidence(text, 100 * score, "%", 80.0, likelihood(max(score, 0.0), 0.8, 0.95), at_s)
+        kept = min(camera.kept, key=lambda each: abs(each - i))
+        shown = (
+            Shown(f"{camera.name} at {window.since(camera.times_ns[kept]):.1f} s of this run", camera.kept[kept]),
+            Shown(f"{camera.name} at the end in the data: {pair.card.places[last][0]}", pair.card.thumbnails[last]),
+        )
+        return Evidence(text, 100 * score, "%", 80.0, likelihood(max(score, 0.0), 0.8, 0.95), at_s, pictures=shown)
 
     @staticmethod
     def _ended(window: Window, card: Card, times_ns: Times) -> NDArray[np.bool_]:
