@@ -318,11 +318,11 @@ class UnseenSuccess(CardCause):
             f"and {camera.name} sees what it saw there ({100 * score:.0f} % of the way from their beginnings)."
         )
         kept = min(camera.kept, key=lambda each: abs(each - i))
-        shown = (
+        beside = (
             Shown(f"{camera.name} at {window.since(camera.times_ns[kept]):.1f} s of this run", camera.kept[kept]),
             Shown(f"{camera.name} at the end in the data: {pair.card.places[last][0]}", pair.card.thumbnails[last]),
         )
-        return Evidence(text, 100 * score, "%", 80.0, likelihood(max(score, 0.0), 0.8, 0.95), at_s, pictures=shown)
+        return Evidence(text, 100 * score, "%", 80.0, likelihood(max(score, 0.0), 0.8, 0.95), at_s, pictures=beside)
 
     @staticmethod
     def _ended(window: Window, card: Card, times_ns: Times) -> NDArray[np.bool_]:
