@@ -346,7 +346,7 @@ NAMED = ["pan", "lift", "elbow", "gripper"]
     ],
     ids=["a list", "a list in a list", "a list in an object", "places", "none", "too few", "one for all"],
 )
-def test_datasets_of_others_are_read_however_they_name_joints(names, first, plain_dataset, tmp_path):
+def test_foreign_datasets_are_read_however_they_name_joints(names, first, plain_dataset, tmp_path):
     root = as_others_write(shutil.copytree(plain_dataset, tmp_path / "set"), "v3.0", names)
     window = read_episode(root.with_name("set:1"))
     assert window.joints[0] == first
