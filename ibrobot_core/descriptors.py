@@ -111,6 +111,15 @@ class Options:
         """Of sensors: height and width of the images [px], if the options define them."""
         return None
 
+    @property
+    def lens(self) -> Mapping[str, Any] | None:
+        """Of cameras: the intrinsics, as fields of `CameraInfo` without the header in plain values; None if unknown.
+
+        Raises:
+            SensorError: if the options could have them and do not; says what to set.
+        """
+        return None
+
     def find_device(self) -> None:
         """Of sensors: looks for the device that the options name, without opening it.
 
@@ -416,6 +425,12 @@ class DecoderDescriptor:
 
     Equal bytes give equal pixels, in a run and in a conversion. The decoder raises `ContractError` if an image is
     damaged.
+    """
+    rectifier: Callable[[Mapping[str, Any]], Callable[[Any], Any]] | None = None
+    """Intrinsics as `Options.lens` has them -> what removes the distortion from images.
+
+    That maps arrays of shape (H, W, C) to arrays of the same shape and type, in a run and in a conversion with the same
+    bits. `ContractError` is raised for intrinsics that are not those of a camera, and for images of another size.
     """
 
 

@@ -315,6 +315,18 @@ class Registry:
         formats = ", ".join(sorted({each for decoder in self.decoders for each in decoder.formats})) or "none"
         raise ContractError(f"no installed plugin decodes a {picture.format!r} picture; those decoded are: {formats}")
 
+    def rectifier(self, lens: Mapping[str, Any]) -> Callable[[Any], Any]:
+        """What removes the distortion of a lens from images.
+
+        Raises:
+            PluginError: if no installed plugin can.
+            ContractError: if the intrinsics are not those of a camera.
+        """
+        for decoder in self.decoders:
+            if decoder.rectifier is not None:
+                return decoder.rectifier(lens)
+        raise self.not_found("rectifier", "lens")
+
     def not_found(self, kind: str, type_: str) -> PluginError:
         """The error for an unavailable type or command (kind `command`), with the package to install or to repair."""
         what = plugin_type(kind, type_)

@@ -169,6 +169,7 @@ class ImageSpec:
         None, unit="px", validator=_check_size, help="[height, width]; None keeps the camera's size"
     )
     encoding: str = option("rgb8", choices=("rgb8", "bgr8", "mono8", "16UC1", "32FC1"), help="encoding of the array")
+    rectify: bool = option(False, help="remove the distortion of the lens, whose intrinsics the peripheral has")
 
 
 @documented

@@ -13,7 +13,7 @@ from ibrobot_core.config.structure import ParsedComponent, ParsedSections
 from ibrobot_core.config.yaml_nodes import Document
 from ibrobot_core.convert import Key
 from ibrobot_core.descriptors import Options, StreamOptions
-from ibrobot_core.errors import ContractError
+from ibrobot_core.errors import ContractError, IbrobotError
 from ibrobot_core.options import did_you_mean
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.schema import TASK_KEY, ActionSpec, ContractConfig, ExecutorConfig, ObservationSpec, SignalSpec
@@ -90,6 +90,8 @@ class ContractChecks:
             return spec
         if not spec.topic.startswith("/"):
             self.document.add((*key, "topic"), f"a topic starts with /, got {spec.topic!r}")
+        if spec.image is not None and spec.image.rectify:
+            self.document.add((*key, "image", "rectify"), "needs a peripheral, which has the intrinsics of the camera")
         spec = completed(spec)
         if not spec.type:
             self.document.add(key, f"needs a type, which topic {spec.topic} does not determine")
@@ -137,7 +139,20 @@ class ContractChecks:
             return spec
         spec = completed(spec, peripheral)
         self._fits(key, spec)
+        if spec.image is not None and spec.image.rectify and part is not None:
+            self._rectified((*key, "image", "rectify"), peripheral)
         return spec
+
+    def _rectified(self, key: Key, camera: schema.PeripheralConfig) -> None:
+        """Check that the intrinsics of a camera are known."""
+        try:
+            if (lens := camera.options.lens) is not None:
+                installed_plugins().rectifier(lens)
+                return
+            reason = f"a peripheral of type {camera.type!r} does not know the intrinsics of its camera"
+        except IbrobotError as error:
+            reason = str(error)
+        self.document.add(key, reason)
 
     def _fits(self, key: Key, spec: ObservationSpec) -> None:
         """Check that `image` and `select` fit the message type."""

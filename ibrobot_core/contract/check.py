@@ -46,8 +46,13 @@ def check_policy(contract: Contract, spec: PolicySpec, norm_mode: str = "radians
 
 
 def _restricted(canonical: Mapping[str, Any], spec: PolicySpec) -> dict[str, Any]:
-    """A contract reduced to the observations that the policy reads."""
-    seen = {key: parts for key, parts in canonical["observations"].items() if key in spec.observations}
+    """A contract reduced to the observations that the policy reads; a rectified image may be of any lens."""
+    any_lens: dict[str, Any] = {"model": {"rectify": {}}}
+    seen = {
+        key: [part | any_lens if "rectify" in part.get("model", ()) else part for part in parts]
+        for key, parts in canonical["observations"].items()
+        if key in spec.observations
+    }
     return {**canonical, "observations": seen}
 
 

@@ -33,7 +33,7 @@ class _Part:
         self.part = part
         self.stream: Stream[Message] = Stream(part.align, contract.step_ns, ns(contract.max_age))
         self._read: Callable[[Any], _Array] = (
-            part.selection if part.image is None else partial(decode_image, spec=part.image)
+            part.selection if part.image is None else partial(decode_image, spec=part.image, rectify=part.rectifier)
         )
         self._sample: Sample[Message] | None = None
         self._value: _Array | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import attrs
@@ -50,8 +51,10 @@ def pixels(message: Image) -> NDArray[np.generic]:
     return typed.astype(element, copy=False)
 
 
-def decode_image(message: Image | CompressedImage, spec: ImageSpec) -> NDArray[np.generic]:
-    """Decode an image as the contract specifies: resize it, then convert its encoding.
+def decode_image(
+    message: Image | CompressedImage, spec: ImageSpec, rectify: Callable[[Any], Any] | None = None
+) -> NDArray[np.generic]:
+    """Decode an image as the contract specifies: rectify and resize it, then convert its encoding.
 
     Returns:
         Shape (H, W, C): uint8 for rgb8, bgr8 and mono8; uint16 for 16UC1 [mm]; float32 for 32FC1 [m]. Depth is 0 for
@@ -62,7 +65,7 @@ def decode_image(message: Image | CompressedImage, spec: ImageSpec) -> NDArray[n
     """
     if isinstance(message, CompressedImage):
         message = installed_plugins().decode(message)
-    array = pixels(message)
+    array = pixels(message) if rectify is None else rectify(pixels(message))
     if spec.resize is not None and spec.resize != array.shape[:2]:
         array = resize(array, *spec.resize)
     return np.ascontiguousarray(_convert(array, message.encoding, spec.encoding))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -39,7 +39,13 @@ class ObservationPart:
     feature: Feature
     """Shape of this part alone; -1 for a dimension that only the messages determine."""
     model: Mapping[str, Any] = attrs.field(factory=dict)
-    """What computed numbers depend on: first word of their paths -> `FeatureDescriptor.model`."""
+    """What computed numbers depend on: first word of their paths -> `FeatureDescriptor.model`. Of a rectified image,
+    `rectify` -> the intrinsics of its camera."""
+
+    @property
+    def rectifier(self) -> Callable[[Any], Any] | None:
+        """Removes the distortion of the lens from an image; None if the contract does not ask for it."""
+        return installed_plugins().rectifier(self.model["rectify"]) if "rectify" in self.model else None
 
     @property
     def selection(self) -> Selection:
@@ -264,7 +270,8 @@ def _observation(spec: ObservationSpec, config: RobotConfig) -> ObservationPart:
     if type_ == Image.ros_type:
         image = spec.image or ImageSpec()
         size = peripheral.options.picture if peripheral is not None else None
-        return ObservationPart(spec.key, spec.topic, type_, (), image, align, _image_feature(image, size))
+        lens = {"rectify": peripheral.options.lens} if peripheral is not None and image.rectify else {}
+        return ObservationPart(spec.key, spec.topic, type_, (), image, align, _image_feature(image, size), lens)
     model = _model(config.robot, spec.select)
     return _vector(spec.key, spec.topic, type_, spec.select, align, model, config.robot.joint_names)
 
@@ -312,8 +319,9 @@ def _recorded_observation(key: str, part: Mapping[str, Any]) -> ObservationPart:
     if part["encoding"] is None:
         return _vector(key, part["topic"], part["type"], part["select"], align, part.get("model", {}))
     height, width, _ = part["shape"]
-    image = ImageSpec((height, width) if min(height, width) > 0 else None, part["encoding"])
-    return ObservationPart(key, part["topic"], part["type"], (), image, align, _image_feature(image, None))
+    model = part.get("model", {})
+    image = ImageSpec((height, width) if min(height, width) > 0 else None, part["encoding"], "rectify" in model)
+    return ObservationPart(key, part["topic"], part["type"], (), image, align, _image_feature(image, None), model)
 
 
 def _recorded_action(topic: str, max_age: float | None = None, **part: Any) -> ActionPart:

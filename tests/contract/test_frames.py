@@ -186,9 +186,9 @@ def test_samples_are_decoded_once_and_only_when_a_frame_asks(
     decoded: list[int] = []
     decode = decode_image
 
-    def counting(message: Any, spec: ImageSpec) -> Any:
+    def counting(message: Any, spec: ImageSpec, rectify: Any) -> Any:
         decoded.append(message.header.stamp_ns)
-        return decode(message, spec)
+        return decode(message, spec, rectify)
 
     monkeypatch.setattr(frames_module, "decode_image", counting)
     assembler = FrameAssembler(contract, keys=["observation.images.top"])

@@ -53,6 +53,8 @@ def offers() -> dict[str, dict[str, list[str]]]:
             kinds["reader"] = readers
         if features := sorted(each.name for offered in hooks.ibrobot_features() for each in offered):
             kinds["feature"] = features
+        if any(each.rectifier is not None for offered in hooks.ibrobot_decoders() for each in offered):
+            kinds["rectifier"] = ["lens"]
         own = {name for name, owner in registry.command_packages.items() if owner == package}
         if commands := sorted(name for name in own if " " not in name or name.partition(" ")[0] not in own):
             kinds["command"] = commands

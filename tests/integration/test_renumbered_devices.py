@@ -134,9 +134,9 @@ def test_devices_that_are_named_by_what_stays_are_found(bench: Bench, tmp_path: 
 
 
 def test_a_robot_that_counts_ports_refuses_exchanged_arms_and_says_which_is_which(bench: Bench, tmp_path: Path) -> None:
-    paths = [str(tmp_path / name) for name in ("ttyACM0", "ttyACM1")]
+    follower, leader = (str(tmp_path / name) for name in ("ttyACM0", "ttyACM1"))
     bench.boot({"FOLLOWER": "ttyACM0", "LEADER": "ttyACM1"}, VIDEOS[0])
-    config = robot(tmp_path, *paths, {"top": 0, "wrist": 2})
+    config = robot(tmp_path, follower, leader, {"top": 0, "wrist": 2})
     arm = follower_of(config)
     arm.connect()
     arm.disconnect()

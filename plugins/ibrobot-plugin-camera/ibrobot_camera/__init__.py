@@ -31,8 +31,12 @@ def ibrobot_sensors() -> Iterable[SensorDescriptor]:
 
 @hookimpl
 def ibrobot_decoders() -> Iterable[DecoderDescriptor]:
-    """The decoder of JPEG images."""
-    yield DecoderDescriptor(("jpeg", "png", "compressedDepth png"), Late("ibrobot_ros2.pictures:decode_picture").load)
+    """The decoder of JPEG images, and what removes the distortion of a lens from images."""
+    yield DecoderDescriptor(
+        ("jpeg", "png", "compressedDepth png"),
+        Late("ibrobot_ros2.pictures:decode_picture").load,
+        Late("ibrobot_camera.rectify:Rectifier.of"),
+    )
 
 
 @hookimpl

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import attrs
 
 from ibrobot_camera.device import LIST, NO_DEVICE, find_device
-from ibrobot_core.api import MissingDependency, OptionFault, Options, SensorError, documented, option
+from ibrobot_core.api import Header, MissingDependency, OptionFault, Options, SensorError, documented, option
 
 if TYPE_CHECKING:
     from ibrobot_core.api import Robot
@@ -65,6 +65,20 @@ class OpenCvOptions(Options):
                 load_info(self.info)
             except SensorError as error:
                 yield OptionFault(("info",), str(error))
+
+    @property
+    def lens(self) -> Mapping[str, Any]:
+        """The intrinsics in the calibration file.
+
+        Raises:
+            SensorError: if it cannot be read, or there is none.
+        """
+        from ibrobot_camera.calibration import load_info
+        from ibrobot_camera.rectify import facts_of
+
+        if self.info is None:
+            raise SensorError("needs `info` of the camera: a calibration file, as `ibrobot camera calibrate` writes it")
+        return facts_of(load_info(self.info)(Header()))
 
     def devices(self) -> Mapping[str, str]:
         """The resolved path of a V4L2 device; streams and files can be opened more than once."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import attrs
 
@@ -146,3 +146,11 @@ class CameraOptions(Options):
     def picture(self) -> tuple[int, int]:
         """Height and width of the images [px]."""
         return self.height, self.width
+
+    @property
+    def lens(self) -> Mapping[str, Any]:
+        """A pinhole: a simulated camera has no distortion. Its focal length, which the scene knows, changes nothing."""
+        same = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+        p = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+        size = {"width": self.width, "height": self.height}
+        return {**size, "distortion_model": "plumb_bob", "d": [], "k": same, "r": same, "p": p}
