@@ -155,7 +155,7 @@ def _error_texts(error: BaseException) -> tuple[list[str], int]:
     if isinstance(error, KeyboardInterrupt):
         return ["stopped"], _INTERRUPTED
     if isinstance(error, click.UsageError):
-        hint = f"; see {error.ctx.command_path} --help" if error.ctx is not None else ""
+        hint = f"; see `{error.ctx.command_path} --help`" if error.ctx is not None else ""
         message = error.format_message().replace("\n", " ").removesuffix(".")
         return [f"{message}{_suggestion(message, error.ctx)}{hint}"], _WRONG
     if isinstance(error, OSError) and (system_error := _system_error(error)) is not None:

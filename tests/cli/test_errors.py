@@ -34,11 +34,11 @@ def bugs(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (("nothing",), 2, "No such command 'nothing'; see ibrobot --help"),
-        (("config", "check", "a", "b"), 2, "Got unexpected extra argument (b); see ibrobot config check --help"),
-        (("odd", "read"), 2, "Missing argument 'FILE'; see ibrobot odd read --help"),
-        (("odd", "xyzzy"), 2, "No such command 'xyzzy'; see ibrobot odd --help"),
-        (("confg",), 2, "No such command 'confg', did you mean 'config'?; see ibrobot --help"),
+        (("nothing",), 2, "No such command 'nothing'; see `ibrobot --help`"),
+        (("config", "check", "a", "b"), 2, "Got unexpected extra argument (b); see `ibrobot config check --help`"),
+        (("odd", "read"), 2, "Missing argument 'FILE'; see `ibrobot odd read --help`"),
+        (("odd", "xyzzy"), 2, "No such command 'xyzzy'; see `ibrobot odd --help`"),
+        (("confg",), 2, "No such command 'confg', did you mean 'config'?; see `ibrobot --help`"),
         (("odd", "read", "no.txt"), 2, "no.txt: No such file or directory"),
         (("odd", "ask"), 130, "stopped"),
     ],

@@ -251,7 +251,10 @@ def _document(path: Path, tool: str | None = None, device: str = "") -> tuple[st
         text = path.read_text()
         return text, json.loads(text, object_pairs_hook=_once)
     except FileNotFoundError:
-        remedy = "calibrate with the command of the hardware's plugin"
+        files = calibration_path("any").parent.glob("*.json")
+        names = sorted(file.stem for file in files if not file.stem.endswith(".meta"))
+        calibrate = "calibrate with the command of the hardware's plugin"
+        remedy = f"{f'name one of yours: {", ".join(names)}' if names else calibrate}; or give the path of a file"
         if tool:
             name = path.stem if path == calibration_path(path.stem) else path
             remedy = f"`{tool} calibrate --name {name}` makes one"

@@ -71,7 +71,8 @@ def test_files_that_are_none_are_refused(tmp_path: Path, text: str, message: str
         load_calibration(tmp_path / "arm.json")
 
 
-def test_a_missing_file_says_how_to_make_one(tmp_path: Path) -> None:
+def test_a_missing_file_says_how_to_make_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     with pytest.raises(
         CalibrationError, match=r"no such calibration; `ibrobot arm calibrate --name \S+/arm.json` makes one"
     ):
@@ -80,6 +81,12 @@ def test_a_missing_file_says_how_to_make_one(tmp_path: Path) -> None:
         CalibrationError, match="no such calibration; calibrate with the command of the hardware's plug"
     ):
         load_calibration(tmp_path / "arm.json")
+    made = Calibration({"pan": JointCalibration(**GOOD)}, date="2026-01-02")
+    calibration_path("left").parent.mkdir(parents=True)
+    for name in ("right.v2", "left"):
+        write_calibration(made, calibration_path(name))
+    with pytest.raises(CalibrationError, match=r"name one of yours: left, right\.v2; or give the path of a file$"):
+        load_calibration("theirs")
 
 
 def test_a_missing_joint_is_named(tmp_path: Path) -> None:
