@@ -52,6 +52,7 @@ from ibrobot_core.interfaces.run import (
     GoalRun as GoalRun,
     GuardedRun as GuardedRun,
     RecordedRun as RecordedRun,
+    MotionScope as MotionScope,
 )
 from ibrobot_core.launch.runtime import Runtime as Runtime
 from ibrobot_core.component import Component as Component, SessionWorker as SessionWorker, CONTROL as CONTROL
@@ -77,14 +78,13 @@ from ibrobot_core.services import (
     NoRequest as NoRequest,
     RequestLimits as RequestLimits,
 )
-from ibrobot_core.launch.authority import Agent as Agent, Authority as Authority
 
 # Episodes and datasets
 from ibrobot_core.contract.frames import FrameAssembler as FrameAssembler, FrameSampler as FrameSampler
 from ibrobot_core.selection import (
     JointFeature as JointFeature,
 )
-from ibrobot_core.contract.specs import SignalPart as SignalPart
+from ibrobot_core.contract.specs import SignalPart as SignalPart, joint_selection as joint_selection
 from ibrobot_core.contract.vectors import PolicyVectors as PolicyVectors
 from ibrobot_core.units import NORM_MODES as NORM_MODES
 

@@ -11,7 +11,8 @@ import logging
 import queue
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Protocol
+from contextvars import ContextVar
+from typing import Any, ClassVar, Protocol
 
 import attrs
 
@@ -97,12 +98,33 @@ class Plugins(Protocol):
     def build_policy(self, config: RobotConfig, name: str, seed: int = 0) -> Any: ...
 
 
-class MotionScope(Protocol):
-    """The scope to which all motion keeps while an agent has authority; `launch.authority.Authority` documents it."""
+class MotionScope:
+    """What all motion keeps to. This is the scope without agents; `ibrobot_terminal.authority` has that of a grant."""
 
-    speed: float
+    acting: ClassVar[ContextVar[Any]] = ContextVar("acting agent", default=None)
+    """The agent for which the present thread works; None for a person."""
+    speed = 1.0
+    """Fraction of the velocity limits that motions must keep to now."""
 
-    def check_path(self, positions: Vector, fastest: float) -> None: ...
+    def __init__(self, session: Any) -> None:
+        self._session = session
+        self.lock = threading.RLock()
+        """Held while the scope changes and goals are sent; never while another lock is taken."""
+
+    @property
+    def grant(self) -> Any:
+        """What an agent is granted now; None without a grant."""
+        return None
+
+    def taken_over(self, what: str, policy: bool = False) -> None:
+        """Note that the mode is entered or reset; `policy`: that it starts a policy. Refuses what is not granted."""
+
+    def check_path(self, positions: Vector, fastest: float) -> None:
+        """Check the path of a goal, positions of all joints [rad], shape (N, J), at a fraction of the speed limits."""
+
+    def admits_plan(self, joints: tuple[str, ...], positions: Vector) -> bool:
+        """Whether a plan may be sent now."""
+        return not self._session.held
 
 
 class RunView(Protocol):

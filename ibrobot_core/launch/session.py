@@ -23,9 +23,8 @@ from ibrobot_core.control.host import ControlHost
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError, MissingDependency
 from ibrobot_core.interfaces import Context, JointReading, OperatorEvent, run_state
 from ibrobot_core.interfaces.executor import ExecutorGoal, MoveJoint
-from ibrobot_core.interfaces.run import CommandSource, LaunchRequest
+from ibrobot_core.interfaces.run import CommandSource, LaunchRequest, MotionScope
 from ibrobot_core.launch.absence import by_cause
-from ibrobot_core.launch.authority import Authority
 from ibrobot_core.launch.episodes import Episodes
 from ibrobot_core.plugins import Registry
 from ibrobot_core.pulses import Pulse
@@ -72,7 +71,7 @@ class Session:
             reached their pose; 0 if it has not.
         held: whether the robot holds after the reset of a fault, or after an agent's authority, until the operator
             enters the mode again.
-        authority: what agents may do.
+        authority: what agents may do; without them, everything.
         start_failed: whether the run ended before all components had started, so that nothing has moved the robot.
     """
 
@@ -114,7 +113,7 @@ class Session:
         self._control: ControlHost | None = None
         self._commanding = threading.Lock()
         self._new_state = threading.Condition()
-        self.authority = Authority(self)
+        self.authority = MotionScope(self)
 
     @cached_property
     def absent(self) -> tuple[run_state.AbsentSensor, ...]:
@@ -254,6 +253,10 @@ class Session:
             IbrobotError: if the guard refuses it, or control has died.
         """
         self.control.call(commands.ChangeWorld(change))
+
+    def limit_speed(self, fraction: float) -> None:
+        """Limit all joints to a fraction of their velocity limits."""
+        self.control.call(commands.LimitSpeed(fraction))
 
     def cancel_goals(self, executor: str = "") -> None:
         """Cancel the goal of an executor, or all goals if it is empty; the executors then hold.

@@ -20,10 +20,10 @@ from ibrobot_mcp.door import AgentDoor
 from ibrobot_mcp.resources import Resources
 from ibrobot_mcp.stdio import Pipes
 from ibrobot_mcp.tokens import add_token
+from ibrobot_terminal.authority import Grant, authority_of
 from mcp import Client, StdioServerParameters
 
 from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
-from ibrobot_core.launch.authority import Grant
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 AGENT = Path(__file__).parents[1] / "shared" / "piped_agent.py"
@@ -93,7 +93,7 @@ class Watched:
 
     def holds(self) -> None:
         """Check that the arm holds, far from its goal, and nobody has authority."""
-        self.until(lambda: not self.session.authority.status().armed)
+        self.until(lambda: not authority_of(self.session).status().armed)
         states = self.session.watch_states()
         for _ in range(20):
             states.get(1.0)
@@ -131,7 +131,7 @@ def watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
 def test_arm_goes_on_while_its_agent_answers_pings(watched: Callable[..., Watched]) -> None:
     run = watched(3.0)
     run.until(lambda: run.pan > 0.6)  # at 0.15 rad/s, that takes longer than the lease
-    assert run.session.authority.status().armed == "1:piped"
+    assert authority_of(run.session).status().armed == "1:piped"
 
 
 def test_arm_holds_when_its_agent_is_killed(watched: Callable[..., Watched]) -> None:
@@ -145,7 +145,7 @@ def test_arm_holds_when_its_agent_is_frozen_and_stays_so_when_it_thaws(watched: 
     run = watched(3.0)
     run.agent.send_signal(signal.SIGSTOP)
     run.holds()
-    assert "has been silent for" in run.session.authority.status().ended
+    assert "has been silent for" in authority_of(run.session).status().ended
     at = run.pan
     run.agent.send_signal(signal.SIGCONT)
     states = run.session.watch_states()
@@ -190,7 +190,7 @@ def test_arm_holds_when_its_agent_is_out_of_reach(tmp_path: Path, monkeypatch: p
             while session.state is None or session.state.command[0] < 0.02:
                 await asyncio.sleep(0)
             relay.cut.set()
-            while session.authority.status().armed:
+            while authority_of(session).status().armed:
                 await asyncio.sleep(0)
             asking.cancel()
             relay.cut.clear()
@@ -208,7 +208,7 @@ def test_arm_holds_when_its_agent_is_out_of_reach(tmp_path: Path, monkeypatch: p
         assert (session.state.command == rest).all()
         assert rest[0] < 1.0
         assert session.held
-        assert "silent for" in session.authority.status().ended
+        assert "silent for" in authority_of(session).status().ended
     finally:
         relay.close()
         runtime.stop()

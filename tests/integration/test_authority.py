@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from ibrobot_mcp.work import WorkServices
+from ibrobot_terminal.authority import AGENT_LOG, ARM, DISARM, STATUS, Agent, Grant, authority_of
 
 from ibrobot_core.api import (
     FollowTrajectory,
@@ -30,7 +31,6 @@ from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins,
 from ibrobot_core.contract.specs import joint_selection
 from ibrobot_core.control.commands import LimitSpeed
 from ibrobot_core.errors import ContractError, HardwareError, IbrobotError, NotSupported, RequestError, TransportError
-from ibrobot_core.launch.authority import AGENT_LOG, ARM, DISARM, STATUS, Agent, Grant
 
 CONFIG = Path(__file__).parents[2] / "configs" / "so101_blind.yaml"
 GO_TO = "/planning/go_to"
@@ -47,7 +47,7 @@ class AgentRun:
         config = load_config(self.config, sim=True, mode=self.mode, overrides=overrides, registry=installed_plugins())
         self.runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, **request)))
         self.session = self.runtime.session
-        self.authority = self.session.authority
+        self.authority = authority_of(self.session)
         self.commands: list[np.ndarray] = []
         self.session.on_state.append(lambda state: self.commands.append(state.command.copy()))
         self.log = self.session.bus.subscribe(AGENT_LOG, 1000)

@@ -34,6 +34,7 @@ from ibrobot_lerobot_program.features import RobotFeatures
 from ibrobot_lerobot_program.run import ProgramSource
 from ibrobot_ros2.calls import GoalRequest
 from ibrobot_ros2.goals import Actions
+from ibrobot_terminal.authority import Grant, authority_of
 from ibrobot_web import commands as page_commands
 from ibrobot_web.messages import Sent, from_page, from_server, to_run
 from ibrobot_webxr.messages import Hands, decode
@@ -44,7 +45,6 @@ from ibrobot_core.channel import Channel
 from ibrobot_core.config import RobotConfig, from_document, load_config
 from ibrobot_core.errors import IbrobotError
 from ibrobot_core.interfaces.run import LaunchRequest
-from ibrobot_core.launch.authority import Grant
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Session
 from ibrobot_core.plugins import installed_plugins
@@ -432,7 +432,7 @@ class Agent(GoTo):
 
     @override
     def meet(self) -> None:
-        self.agent = self.run.session.authority.join("agent")
+        self.agent = authority_of(self.run.session).join("agent")
         self.again()
 
     @override
@@ -441,11 +441,11 @@ class Agent(GoTo):
 
     @override
     def call(self, service: str, request: Any = None) -> Any:
-        return self.run.session.authority.call(self.agent, service, request)
+        return authority_of(self.run.session).call(self.agent, service, request)
 
     @override
     def die(self) -> None:
-        self.run.session.authority.leave(self.agent)
+        authority_of(self.run.session).leave(self.agent)
 
 
 class _Wire:

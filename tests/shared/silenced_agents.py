@@ -28,10 +28,10 @@ import attrs
 import numpy as np
 from ibrobot_mcp.door import AgentDoor
 from ibrobot_mcp.tokens import add_token
+from ibrobot_terminal.authority import MOVING, Grant, authority_of
 
 from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
 from ibrobot_core.errors import IbrobotError
-from ibrobot_core.launch.authority import MOVING, Grant
 
 CONFIG = Path(__file__).parents[2] / "configs" / "so101_pick_cube.yaml"
 AGENT = Path(__file__).with_name("http_agent.py")
@@ -159,7 +159,9 @@ class SilencedRun:
             if condition():
                 return
             states.get(1.0)
-        raise AssertionError(f"{what} does not come about; mode {self.session.mode}, {self.session.authority.status()}")
+        raise AssertionError(
+            f"{what} does not come about; mode {self.session.mode}, {authority_of(self.session).status()}"
+        )
 
     def ticks(self, count: int) -> None:
         """Let time pass."""
@@ -199,7 +201,7 @@ class SilencedRun:
         assert agent.stdout is not None
         try:
             assert agent.stdout.readline() == "ready\n"
-            (name,) = (each for each in session.authority.status().agents if each.endswith(f":agent{self._number}"))
+            (name,) = (each for each in authority_of(session).status().agents if each.endswith(f":agent{self._number}"))
             session.bus.call("/agent/arm", Grant(600.0, GRANTED, speed=SPEED, lease=LEASE_S, agent=name))
             begin = self.command
             agent.stdin.write(json.dumps(what.calls) + "\n")
@@ -210,7 +212,7 @@ class SilencedRun:
                 self.until(lambda: session.mode == what.mode and abs(self.command[i] - begin[i]) > far, moment)
             else:
                 self.ticks(self.random.randrange(30))
-            if session.authority.status().armed != name:
+            if authority_of(session).status().armed != name:
                 return "its authority has ended before"
             return self._silenced(agent, relay, way)
         finally:
@@ -230,7 +232,7 @@ class SilencedRun:
             agent.send_signal(signal.SIGSTOP)
         else:
             relay.cut.set()
-        self.until(lambda: not session.authority.status().armed, "the end of the authority")
+        self.until(lambda: not authority_of(session).status().armed, "the end of the authority")
         self.latest_s = max(self.latest_s, (session.clock.now_ns() - begun_ns) * 1e-9)
         self.ticks(_BRAKE_TICKS)
         rest = self.command
@@ -241,7 +243,7 @@ class SilencedRun:
             agent.send_signal(signal.SIGCONT)
         relay.cut.clear()
         self.ticks(2 * _WATCHED_TICKS)
-        if session.authority.status().armed or np.abs(self.command - rest).max() > _STILL_RAD:
+        if authority_of(session).status().armed or np.abs(self.command - rest).max() > _STILL_RAD:
             return "the arm moves when the agent is back"
         return "holds" if session.held else "the robot does not hold"
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, get_args, override
 import attrs
 
 from ibrobot_core.api import NS_PER_S, Contract, NotSupported, RecorderError, documented, option, seconds
-from ibrobot_core.app import Authority, Episodes, NoRequest, RecordedRun, Service, wrong_input
+from ibrobot_core.app import Episodes, NoRequest, RecordedRun, Service, wrong_input
 from ibrobot_data.conversion import OUTCOMES
 from ibrobot_data.cues import Cue
 from ibrobot_data.episode_dataset import EpisodeDataset, count_complete
@@ -163,7 +163,6 @@ class EpisodeService(Episodes):
 
     def __init__(self, session: RecordedRun, recording: RecordingWorker) -> None:
         super().__init__(session)
-        assert isinstance(session.authority, Authority)
         self._agent = session.authority.acting
         self._by_agent = False
         """Whether an agent has asked for the present or last episode."""

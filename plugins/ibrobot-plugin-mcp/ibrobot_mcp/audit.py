@@ -12,20 +12,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ibrobot_terminal.authority import authority_of
+
 from ibrobot_core.api import HardwareError
-from ibrobot_core.app import Authority, RunView
+from ibrobot_core.app import RunView
 
 LATE_S = 5.0
 """How long an entry may wait to be written [s]."""
 _AGAIN_S = 1.0
 """Time after which a write that failed is tried again [s]."""
-
-
-def authority_of(session: RunView) -> Authority:
-    """What agents may do in a run."""
-    authority = session.authority
-    assert isinstance(authority, Authority)
-    return authority
 
 
 def audit_path(session: RunView) -> Path:

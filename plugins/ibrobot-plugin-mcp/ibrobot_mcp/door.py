@@ -10,9 +10,10 @@ from typing import override
 
 from ibrobot_http.addresses import host_names
 from ibrobot_http.listener import listen, tls_context
+from ibrobot_terminal.authority import authority_of
 
 from ibrobot_core.app import CONTROL, Pulse, RunView, SessionWorker
-from ibrobot_mcp.audit import AuditFile, authority_of
+from ibrobot_mcp.audit import AuditFile
 from ibrobot_mcp.options import McpOptions
 from ibrobot_mcp.persons import Persons
 from ibrobot_mcp.server import PIPES, AgentServer

@@ -14,9 +14,10 @@ from typing import Any
 
 from ibrobot_ros2.services import plain
 from ibrobot_terminal.agent_calls import AgentCalls, planned_path
+from ibrobot_terminal.authority import Authority
 
 from ibrobot_core.api import IbrobotError, did_you_mean
-from ibrobot_core.app import Authority, RequestError, RunView, error_text
+from ibrobot_core.app import RequestError, RunView, error_text
 from ibrobot_mcp.tokens import own_folder
 
 SERVICES = ("/agent/arm", "/agent/disarm", "/agent/status")

@@ -18,14 +18,14 @@ import anyio
 import anyio.to_thread
 import attrs
 import mcp_types as types
+from ibrobot_terminal.authority import Agent, authority_of
 from mcp import MCPError
 from mcp.server.auth.middleware.bearer_auth import AuthenticatedUser
 from mcp.server.auth.provider import AccessToken
 from mcp.server.lowlevel.server import Server
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import Agent, RequestError, RunView, error_text
-from ibrobot_mcp.audit import authority_of
+from ibrobot_core.app import RequestError, RunView, error_text
 from ibrobot_mcp.prompts import PROMPTS, prompt
 from ibrobot_mcp.resources import Resources
 from ibrobot_mcp.tokens import agent_of

@@ -15,10 +15,10 @@ import mcp_types as types
 from ibrobot_provenance.option_schemas import OptionSchemas
 from ibrobot_ros2.run_cameras import cameras
 from ibrobot_ros2.services import plain
+from ibrobot_terminal.authority import Agent, authority_of
 
 from ibrobot_core.api import IbrobotError, documented, option, seconds
-from ibrobot_core.app import Agent, RequestError, RunView, Service, fields
-from ibrobot_mcp.audit import authority_of
+from ibrobot_core.app import RequestError, RunView, Service, fields
 from ibrobot_mcp.pictures import Sight, look
 
 NAMES: Mapping[str, str] = {

@@ -18,6 +18,7 @@ from ibrobot_provenance.asking import read_event
 from ibrobot_provenance.processes import Job, Jobs, arguments
 from ibrobot_provenance.reports import Case, Cases, Plots, ReportSection, Table, Text, kinds_of_reports
 from ibrobot_provenance.work import Work, Workplace
+from ibrobot_terminal.authority import authority_of
 
 from ibrobot_core.api import EpisodeAddress, IbrobotError, MissingDependency, option
 from ibrobot_core.app import (
@@ -31,7 +32,7 @@ from ibrobot_core.app import (
     error_text,
     installed_plugins,
 )
-from ibrobot_mcp.audit import authority_of, states_folder
+from ibrobot_mcp.audit import states_folder
 from ibrobot_mcp.options import SECTION
 
 _MOST_RESULTS = 1000

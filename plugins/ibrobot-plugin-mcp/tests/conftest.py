@@ -10,6 +10,7 @@ from typing import Any, cast
 import attrs
 import pytest
 from ibrobot_mcp.server import AgentServer
+from ibrobot_terminal.authority import authority_of
 from ibrobot_testing import make_session, stand_in
 from mcp import Client
 
@@ -58,7 +59,7 @@ class Rig:
             "write_plan": self.plan,
         }
         self.session.control = cast("Any", SimpleNamespace(**control, stops=0))
-        self.authority = self.session.authority
+        self.authority = authority_of(self.session)
         bus = self.session.bus
         bus.serve(stand_in("/set_mode"), lambda request: None)
         bus.serve(MOVE, self.move)

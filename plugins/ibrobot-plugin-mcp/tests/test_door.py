@@ -18,13 +18,13 @@ from typing import Any, cast, override
 import httpx2
 import pytest
 from ibrobot_mcp import audit, commands, ibrobot_commands, ibrobot_sections, persons, stdio
-from ibrobot_mcp.audit import authority_of
 from ibrobot_mcp.commands import AddAgent, ArmAgent, DisarmAgent, ListAgents, RemoveAgent, ShowAgents
 from ibrobot_mcp.door import AgentDoor
 from ibrobot_mcp.options import McpOptions
 from ibrobot_mcp.persons import ask, running, sockets_folder
 from ibrobot_mcp.stdio import Pipes, serve_pipes
 from ibrobot_mcp.tokens import add_token, agent_of, remove_token
+from ibrobot_terminal.authority import authority_of
 from ibrobot_testing import SectionSuite, check_descriptor, make_session, stand_in
 from mcp import Client
 from mcp.client.streamable_http import streamable_http_client

@@ -18,10 +18,11 @@ from ibrobot_mcp import work
 from ibrobot_mcp.work import Places, WorkResult, WorkServices, report_lines
 from ibrobot_provenance.reports import Case, Cases, Plots, ReportDescriptor, ReportSection, Table, Text
 from ibrobot_provenance.work import Work, Workplace, some_options
+from ibrobot_terminal.authority import Agent
 from ibrobot_testing import make_session
 
 from ibrobot_core.api import IbrobotError, Options, option
-from ibrobot_core.app import Agent, Command, Event, Registry, RequestError, RunView, Session, Shown
+from ibrobot_core.app import Command, Event, Registry, RequestError, RunView, Session, Shown
 
 
 @attrs.frozen(kw_only=True)

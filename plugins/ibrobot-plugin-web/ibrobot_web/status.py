@@ -14,9 +14,10 @@ from typing import Any, override
 import attrs
 import numpy as np
 from ibrobot_terminal.agent_calls import AgentCalls
+from ibrobot_terminal.authority import authority_of
 
 from ibrobot_core.api import NS_PER_S, JointState, Message, String, Vector
-from ibrobot_core.app import Authority, ControlState, RunView, error_text
+from ibrobot_core.app import ControlState, RunView, error_text
 from ibrobot_web.messages import SERVICES
 from ibrobot_web.modes import modes_json, page_devices
 from ibrobot_web.teleop import JOG
@@ -66,8 +67,7 @@ class LogLines(logging.Handler):
 
 def agents_json(session: RunView, calls: AgentCalls) -> dict[str, Any]:
     """The connected agents, what they may do, and what one asked for."""
-    assert isinstance(session.authority, Authority)
-    status, newest = session.authority.status(), calls.newest
+    status, newest = authority_of(session).status(), calls.newest
     asked = None
     if newest is not None:
         service, request = newest.plan or ("", {})

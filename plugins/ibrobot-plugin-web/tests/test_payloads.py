@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from ibrobot_ros2.jpeg import to_jpeg
 from ibrobot_terminal import PanelDescriptor
 from ibrobot_terminal.agent_calls import AgentCalls
+from ibrobot_terminal.authority import authority_of
 from ibrobot_testing import make_session, stand_in
 from ibrobot_web.link import JPEG, PICTURE_HEAD, FrameSender
 from ibrobot_web.objects import SceneObjects
@@ -150,7 +151,7 @@ def test_the_status_has_what_an_agent_asked_for_last_that_moves_the_robot() -> N
     for service in ("/planning/go_to", "/test/look", "/estop"):
         declared = attrs.evolve(stand_in(service), reads=service == "/test/look", urgent=service == "/estop")
         session.bus.serve(declared, lambda request: 1)
-    authority = session.authority
+    authority = authority_of(session)
     agent = authority.join("claude")
     nothing = {"connected": ["1:claude"], "armed": "", "left_s": 0, "speed": None, "ended": "", "asked": None}
     authority.call(agent, "/test/look")

@@ -10,7 +10,8 @@ from typing import Any
 import attrs
 
 from ibrobot_core.api import IbrobotError, seconds
-from ibrobot_core.app import Authority, RunView, error_text
+from ibrobot_core.app import RunView, error_text
+from ibrobot_terminal.authority import authority_of
 
 _LONGEST = 300
 """Longest request of an agent that is shown, in characters."""
@@ -61,8 +62,7 @@ class AgentCalls:
     """
 
     def __init__(self, session: RunView) -> None:
-        assert isinstance(session.authority, Authority)
-        self._session, self._authority = session, session.authority
+        self._session, self._authority = session, authority_of(session)
         self._count = 0
         self.newest: AgentCall | None = None
         self._authority.told.append(self._take)

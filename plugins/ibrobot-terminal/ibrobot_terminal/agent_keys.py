@@ -8,8 +8,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
-from ibrobot_core.app import Authority, RunView
+from ibrobot_core.app import RunView
 from ibrobot_terminal.agent_calls import AgentCall, AgentCalls, AskedPath, planned_path
+from ibrobot_terminal.authority import authority_of
 
 ALLOW, REFUSE, TIME, SPEED = "Y", "N", "T", "V"
 _ARM, _DISARM = "/agent/arm", "/agent/disarm"
@@ -33,8 +34,7 @@ class AgentKeys:
     """
 
     def __init__(self, session: RunView) -> None:
-        assert isinstance(session.authority, Authority)
-        self._session, self._authority = session, session.authority
+        self._session, self._authority = session, authority_of(session)
         self._calls = AgentCalls(session)
         self._seconds, self._speed = list(_SECONDS), list(_SPEEDS)
         self._shown: AgentCall | None = None

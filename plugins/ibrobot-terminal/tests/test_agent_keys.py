@@ -13,6 +13,7 @@ import pytest
 from ibrobot_terminal import agent_keys
 from ibrobot_terminal.agent_calls import AgentCalls, path_of, planned_path
 from ibrobot_terminal.agent_keys import AgentKeys
+from ibrobot_terminal.authority import Agent, authority_of
 from ibrobot_testing import make_session, stand_in
 
 from ibrobot_core.api import (
@@ -22,7 +23,7 @@ from ibrobot_core.api import (
     JointTrajectoryPoint,
     ns,
 )
-from ibrobot_core.app import Agent, Session
+from ibrobot_core.app import Session
 
 GOAL = {"goal": "pan=0.4"}
 KEYS = "Y lets it move   N refuses   T time   V speed"
@@ -51,7 +52,7 @@ class Rig:
             bus.serve(stand_in(name), lambda request: 1)
         for name in ("/planning/plan", "/plan_kinematic_path", "/compute_cartesian_path"):
             bus.serve(attrs.evolve(stand_in(name), reads=True), self._answer)
-        self.authority = self.session.authority
+        self.authority = authority_of(self.session)
         self.authority.open()
         self.keys = AgentKeys(self.session)
 

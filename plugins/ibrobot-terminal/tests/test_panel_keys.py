@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from ibrobot_terminal import run_terminal
+from ibrobot_terminal.authority import Authority
 from ibrobot_terminal.run_terminal import Panel
 
-from ibrobot_core.app import Authority, RunHooks
+from ibrobot_core.app import RunHooks
 
 if TYPE_CHECKING:
     from fake_runs import Runs

@@ -25,7 +25,7 @@ from ibrobot_core.api import (
     did_you_mean,
     resolve_path,
 )
-from ibrobot_core.app import Authority, Component, NoRequest, RobotConfig, RunView, Service, Subscription
+from ibrobot_core.app import Component, NoRequest, RobotConfig, RunView, Service, Subscription
 from ibrobot_planning.world.ages import Age, Limit, Unusable
 from ibrobot_planning.world.bounds import FURTHEST
 from ibrobot_planning.world.hands import hands
@@ -168,8 +168,6 @@ class WorldKeeper(Component):
         self._world = first_world(options, scene)
         super().__init__("world", f"{len(self._world.objects)} objects for planners", ())
         self._session = session
-        assert isinstance(session.authority, Authority)
-        self._authority = session.authority
         self._of_agents: set[str] = set()
         """Names of objects that agents have added."""
         self._lock = threading.RLock()
@@ -287,7 +285,7 @@ class WorldKeeper(Component):
 
     def _with_touched(self, world: World) -> World:
         """The world with what the hand may touch for now."""
-        within, granted = self._touched_within, self._authority.status().grant
+        within, granted = self._touched_within, self._session.authority.grant
         if not self._touched or (within is not None and within is not granted):
             return world
         hand = frozenset(hands(self._session.config.robot, self._arm))
@@ -406,7 +404,7 @@ class WorldKeeper(Component):
             raise PlanningError(f"{ADD.name}: may_touch and movable are for persons only: leave them out")
 
     def _add(self, it: Added) -> list[str]:
-        of_agent = self._authority.acting.get() is not None
+        of_agent = self._session.authority.acting.get() is not None
         try:
             thing = it.object.made()  # outside the lock: reading a mesh is slow, and motions are checked meanwhile
         except ValueError as error:
@@ -465,7 +463,7 @@ class WorldKeeper(Component):
         return world.attach(it.name, link, pose(placed), frozenset((*hand, *it.may_touch)))
 
     def _detach(self, world: World, it: Detached) -> World:
-        if it.may_touch and self._authority.acting.get() is not None:
+        if it.may_touch and self._session.authority.acting.get() is not None:
             raise PlanningError(f"{DETACH.name}: may_touch is for persons only: leave it out")
         thing = world.named(it.name)
         placed = matrix(thing.pose) if thing.link is None else self._link(thing.link) @ matrix(thing.pose)
@@ -476,8 +474,8 @@ class WorldKeeper(Component):
             if name != FLOOR:
                 world.named(name)
         self._touched, self._touched_within = it.objects, None
-        if self._authority.acting.get() is not None:
-            self._touched_within = self._authority.status().grant or "a grant that has ended"
+        if self._session.authority.acting.get() is not None:
+            self._touched_within = self._session.authority.grant or "a grant that has ended"
         return world
 
     @cached_property

@@ -9,11 +9,11 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from ibrobot_terminal.authority import Authority, Grant, authority_of
 from ibrobot_testing import make_session, stand_in
 
 from ibrobot_core.clock import RealClock
 from ibrobot_core.control.commands import CancelGoals, LimitSpeed
-from ibrobot_core.launch.authority import Authority, Grant
 from ibrobot_core.launch.session import Session
 from ibrobot_core.units import ns
 
@@ -34,7 +34,7 @@ def armed(call: Callable[[Any], None], write_plan: Callable[[Any], None]) -> tup
         session.held = False
 
     session.bus.serve(stand_in("/set_mode"), enter)
-    authority = session.authority
+    authority = authority_of(session)
     authority.open()
     authority.join("claude")
     authority.arm(GRANT)

@@ -11,23 +11,28 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from contextvars import Context, ContextVar, copy_context
+from contextvars import Context, copy_context
 from functools import partial
 from json import dumps
-from typing import Any, ClassVar
+from typing import Any, ClassVar, override
 
 import attrs
 import numpy as np
 
-from ibrobot_core.contract.specs import joint_selection
-from ibrobot_core.control.commands import LimitSpeed
-from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported, RequestError
-from ibrobot_core.messages import Header, JointState, String
-from ibrobot_core.options import documented, option
-from ibrobot_core.robot import Vector
-from ibrobot_core.selection import Selection
-from ibrobot_core.services import NoRequest, Plain, Service
-from ibrobot_core.units import ns, seconds
+from ibrobot_core.api import (
+    HardwareError,
+    Header,
+    IbrobotError,
+    JointState,
+    NotSupported,
+    String,
+    Vector,
+    documented,
+    ns,
+    option,
+    seconds,
+)
+from ibrobot_core.app import MotionScope, NoRequest, RequestError, RunView, Service, joint_selection
 
 AGENT_LOG = "/agent/log"
 """std_msgs/msg/String: JSON with what agents ask for, who grants it, and how it ends."""
@@ -38,6 +43,7 @@ _MOST_KEPT, _MOST_REQUEST, _MOST_SHOWN = 20_000, 2_000, 300
 the rest of the panel, in characters."""
 _NOTES_PER_S, _NOTES = 0.2, 50.0
 """Events of the log that move nothing and give nothing, e.g. refused calls and stops: on average, and at once."""
+_asking = threading.Lock()
 _TOLERANCE = 1e-3
 """How far a number may be outside of the region, in its unit, and a speed above that granted, as a fraction."""
 
@@ -102,28 +108,24 @@ class Scope:
     agent: Agent
     grant: Grant
     until_ns: int
-    numbers: Selection | None
-    """Those of the region; None without one."""
+    numbers: Any
+    """Reads those of the region, as `joint_selection` makes it; None without one."""
 
 
-class Authority:
+class Authority(MotionScope):
     """What agents may do in a run, and what they did. Doors for agents share that of the session.
 
     Args:
-        session: the run, a `launch.session.Session`.
+        session: the run, a `Session`.
     """
 
     usual: ClassVar[tuple[str, ...]] = MOVING
     """What a person grants by default, of what a run serves."""
-    acting: ClassVar[ContextVar[Agent | None]] = ContextVar("acting agent", default=None)
-    """The agent for which the present thread works."""
 
     def __init__(self, session: Any) -> None:
-        self._session = session
+        super().__init__(session)
         self._agents: list[Agent] = []
         self._scope: Scope | None = None
-        self.lock = threading.RLock()
-        """Held while the scope changes and goals are sent; never while another lock is taken."""
         self._called: dict[str, tuple[Service[NoRequest, Any] | None, Context]] = {}
         """Services that the agent has called in this scope -> what cancels them, and the context of the call."""
         self._left = ""
@@ -137,8 +139,11 @@ class Authority:
         """Name of an agent, the same in each connection -> how many bounded events of it may come at once, and when."""
         self._left_out: Counter[str] = Counter()
         """Events that had no room since the last one of the log."""
-        self.speed = 1.0
-        """Fraction of the velocity limits that motions must keep to now."""
+
+    @property
+    @override
+    def grant(self) -> Grant | None:
+        return None if self._scope is None else self._scope.grant
 
     def open(self) -> None:
         """Serve `/agent/arm`, `/agent/disarm` and `/agent/status`, for a door that calls `check` at least at 20 Hz."""
@@ -200,19 +205,19 @@ class Authority:
             if outside := self._outside(scope):
                 raise HardwareError(f"{ARM.name}: the robot is not in the region: {outside}; drive it there first")
             self.end("another grant replaces it")
-            session.control.call(LimitSpeed(grant.speed))  # before the mode goes on, which may be that of a policy
+            session.limit_speed(grant.speed)  # before the mode goes on, which may be that of a policy
             try:
                 if session.held:
                     session.bus.call("/set_mode", session.mode)
             except BaseException:
-                session.control.call(LimitSpeed(self.speed))
+                session.limit_speed(self.speed)
                 raise
             self.renew(scope.agent)
             self._called, self._left, self.speed, self._scope = {}, "", grant.speed, scope
         self._note("armed", scope.agent, kept=True, grant=attrs.asdict(grant))
         return f"{scope.agent.name} may move the robot for {grant.seconds:g} s at {grant.speed:.0%} of its speed"
 
-    def call(self, agent: Agent, name: str, request: Plain = None) -> Any:
+    def call(self, agent: Agent, name: str, request: Any = None) -> Any:
         """Call a service of the run for an agent.
 
         Raises:
@@ -274,6 +279,7 @@ class Authority:
         elif why := self._left or self._outside(scope):
             self.end(f"not within the region: {why}")
 
+    @override
     def taken_over(self, what: str, policy: bool = False) -> None:
         """Note that the mode is entered or reset, which ends the authority unless its agent does it.
 
@@ -305,8 +311,9 @@ class Authority:
             with suppress(IbrobotError):  # the service is of another mode, or the run ends
                 act()
         with suppress(IbrobotError), session.changing:  # another grant may have been given meanwhile
-            session.control.call(LimitSpeed(self.speed))
+            session.limit_speed(self.speed)
 
+    @override
     def check_path(self, positions: Vector, fastest: float) -> None:
         """Check the path of a goal of anybody against the present scope.
 
@@ -323,6 +330,7 @@ class Authority:
         if scope is not None and (outside := self._outside(scope, positions)):
             raise HardwareError(f"refused: the path leaves the region that is granted: {outside}")
 
+    @override
     def admits_plan(self, joints: tuple[str, ...], positions: Vector) -> bool:
         """Whether a plan of anybody stays within the present scope; one that does not ends the authority."""
         scope, state = self._scope, self._session.state
@@ -374,6 +382,16 @@ class Authority:
         self._session.log.info("agent %s: %s %s", agent.name, event, shown)
         for call in tuple(self.told):  # one that stops listening meanwhile keeps nothing from the others
             call(entry)
+
+
+def authority_of(session: RunView) -> Authority:
+    """The authority of a run: who asks first puts it in the place of a scope without agents."""
+    run: Any = session
+    with _asking:
+        if not isinstance(run.authority, Authority):
+            run.authority = Authority(session)
+    made: Authority = run.authority
+    return made
 
 
 def _cut(text: str, most: int) -> str:
