@@ -194,7 +194,7 @@ class Policy(ABC):
 
         By default, one after the other. The outputs of a batch share no memory; the next call may overwrite them.
         """
-        return [copy.deepcopy(self.infer(tensors)) for tensors in batch]
+        return [copy.deepcopy(dict(self.infer(tensors))) for tensors in batch]
 
     def fingerprint(self) -> str:
         """Fingerprint on which both sides of `infer` must agree: by default of the spec; policies may add statistics.

@@ -252,7 +252,9 @@ def stop_if_full(error: BaseException, source: str) -> None:
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, DiskFull) or (isinstance(cause, OSError) and cause.errno in (ENOSPC, EDQUOT)):
-            raise DiskFull(f"{source}: {error}") from error
+            # Without its path, which is one of the staging folder.
+            reason = cause.strerror if isinstance(cause, OSError) else str(cause)
+            raise DiskFull(f"{source}: {reason}") from error
         cause = cause.__cause__ or cause.__context__
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -11,11 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import run_here
+from ibrobot_data.episode import stop_if_full
+from ibrobot_data.errors import DiskFull
 from ibrobot_testing.site import Site
 
 from ibrobot_core.api import (
     ActionPart,
     Contract,
+    DatasetError,
     EpisodeEnd,
     EpisodeStart,
     Feature,
@@ -226,3 +231,11 @@ def test_converted_episodes_are_kept_when_the_disk_is_full(convert: Converter, t
     assert again.returncode == 0, again.stderr
     assert json.loads(again.stdout)["resumed"] == 1
     assert len(rows(tmp_path)) == 2
+
+
+def test_full_disk_names_no_file_of_the_staging_folder() -> None:
+    error = DatasetError("/data/.staging/unit/video.mp4: cannot be written")
+    error.__cause__ = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/data/.staging/unit/video.mp4")
+    with pytest.raises(DiskFull) as failed:
+        stop_if_full(error, "pick:1")
+    assert str(failed.value) == "pick:1: No space left on device"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from typing import override
 
 import attrs
@@ -97,9 +97,9 @@ class Finder(Component):
     @override
     def stop(self) -> None:
         self._session.bus.unserve(FIND)
-        with self._lock:
+        with self._lock, ExitStack() as stack:  # one that raises keeps no other open
             for detector, _ in self._detectors.values():
-                detector.close()
+                stack.callback(detector.close)
             self._detectors.clear()
 
     def _find(self, wanted: Find) -> Found:

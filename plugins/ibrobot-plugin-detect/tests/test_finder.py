@@ -154,6 +154,25 @@ def test_detectors_without_pictures_take_none(monkeypatch: pytest.MonkeyPatch) -
     rig.finder.stop()
 
 
+def test_detector_that_raises_at_the_end_keeps_no_other_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig(monkeypatch)
+    closed: list[str] = []
+
+    def detector(name: str, error: Exception | None) -> Any:
+        def close() -> None:
+            closed.append(name)
+            if error is not None:
+                raise error
+
+        return SimpleNamespace(close=close)
+
+    given = {"a": None, "b": RuntimeError("stuck"), "c": None}
+    rig.finder._detectors = {name: (detector(name, error), False) for name, error in given.items()}
+    with pytest.raises(RuntimeError, match="stuck"):
+        rig.finder.stop()
+    assert sorted(closed) == ["a", "b", "c"]
+
+
 def test_options_of_detectors_are_checked_with_the_robot_yaml() -> None:
     assert not list(DetectOptions().check(make_robot(), ()))
     wrong = DetectOptions(use={"apriltag": {"tags": {"cube": {"id": -1, "size": 0.03}}}, "scene": {"size": 3}})

@@ -406,7 +406,7 @@ class InferenceService:
         try:
             # Other threads encode the answers, while the model may overwrite its outputs in the next batch.
             requests = [ticket.message.tensors for ticket in live]
-            outputs = [copy.deepcopy(each) for each in self._policy.infer_batch(requests)]
+            outputs = [copy.deepcopy(dict(each)) for each in self._policy.infer_batch(requests)]
             if len(outputs) != len(live):
                 raise PolicyError(f"{len(outputs)} outputs for a batch of {len(live)}")
         except Exception as error:  # noqa: BLE001 - contained: the request is refused

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any, override
 
 import attrs
@@ -87,7 +87,7 @@ class OneOutput(Net):
     @override
     def infer(self, tensors: Tensors) -> Tensors:
         np.multiply(tensors["x"], 2, out=self._output)
-        return {"twice": self._output}
+        return MappingProxyType({"twice": self._output})  # which `copy.deepcopy` refuses
 
 
 class OneBatchOfOutputs(Net):

@@ -6,13 +6,13 @@ from collections import Counter
 from typing import Any
 
 from ibrobot_core.api import IbrobotError
-from ibrobot_core.app import ControlMode, RobotConfig, installed_plugins
+from ibrobot_core.app import ControlMode, RobotConfig
 
 _PAGE = "web"
 """The type of the teleoperation device that is the robot's page."""
 
 
-def modes_json(config: RobotConfig, *, terminal: bool) -> list[dict[str, Any]]:
+def modes_json(config: RobotConfig, plugins: Any, *, terminal: bool) -> list[dict[str, Any]]:
     """The modes, in the order of the YAML.
 
     Each has its `name`, a `label` that says what it does in the words of the plugins that do it, whether a `policy` or
@@ -20,9 +20,10 @@ def modes_json(config: RobotConfig, *, terminal: bool) -> list[dict[str, Any]]:
 
     Args:
         config: the robot.
+        plugins: the plugins, a `Registry` or as a run has them.
         terminal: whether the run has a terminal.
     """
-    labels = {name: _label(config, mode) for name, mode in config.control_modes.items()}
+    labels = {name: _label(config, mode, plugins) for name, mode in config.control_modes.items()}
     counts = Counter(labels.values())
     return [
         {
@@ -54,22 +55,22 @@ def _jogs(config: RobotConfig, mode: ControlMode) -> dict[str, list[str]]:
     }
 
 
-def _label(config: RobotConfig, mode: ControlMode) -> str:
+def _label(config: RobotConfig, mode: ControlMode, plugins: Any) -> str:
     if mode.inference is not None:
         return f"run the policy {mode.inference.model}"
     if mode.planner is not None:
-        return _words("source", "planner") or mode.name
-    words = {group: _words("teleop", config.teleoperation[name].type) for group, name in mode.devices.items()}
+        return _words(plugins, "source", "planner") or mode.name
+    words = {group: _words(plugins, "teleop", config.teleoperation[name].type) for group, name in mode.devices.items()}
     if len(set(words.values())) == 1:
         groups = " and ".join(filter(None, words))
         return next(iter(words.values())) + (f": {groups}" if groups else "")
     return " and ".join(f"{group}: {text}" if group else text for group, text in words.items()) or mode.name
 
 
-def _words(kind: str, type_: str) -> str:
+def _words(plugins: Any, kind: str, type_: str) -> str:
     """What a plugin says that its type does; its name if it is not installed."""
     try:
-        descriptor = installed_plugins().find(kind, type_)
+        descriptor = plugins.find(kind, type_)
     except IbrobotError:
         return type_
     words: str = descriptor.label or descriptor.summary

@@ -101,7 +101,7 @@ def robot_json(session: RunView) -> dict[str, Any]:
         "groups": {name: list(joints) for name, joints in robot.groups.items()},
         "poses": {name: list(pose) for name, pose in robot.description.poses.items()},
         "tool": robot.description.mjcf is not None,
-        "modes": modes_json(config, terminal=session.request.keys is not None),
+        "modes": modes_json(config, session.registry, terminal=session.request.keys is not None),
     }  # fmt: skip
 
 

@@ -22,7 +22,7 @@ def modes(robot: str, *, terminal: bool = False) -> dict[str, Any]:
     path = find_config(robot, REGISTRY)
     simulated = "simulation:" in path.read_text(encoding="utf-8")
     config = load_config(path, sim=simulated, registry=REGISTRY)
-    return {mode["name"]: mode for mode in modes_json(config, terminal=terminal)}
+    return {mode["name"]: mode for mode in modes_json(config, installed_plugins(), terminal=terminal)}
 
 
 @pytest.mark.parametrize("robot", SHIPPED)

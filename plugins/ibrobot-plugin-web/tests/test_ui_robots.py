@@ -71,6 +71,20 @@ def test_robots_of_a_clone_are_listed_once_and_without_those_of_its_sources(tmp_
     run_ui([tmp_path, configs], test)
 
 
+def test_robots_in_a_folder_named_tests_are_listed_unless_it_is_that_of_a_package(tmp_path: Path) -> None:
+    for place in ("tests", "arms/tests", "package/tests"):
+        (tmp_path / place).mkdir(parents=True)
+        (tmp_path / place / "pan.yaml").write_text(ROBOT)
+    (tmp_path / "package/pyproject.toml").touch()
+
+    async def test(server: UiServer) -> None:
+        listed = await server.get("robots/list")
+        mine = [each["robot"] for each in listed if each["source"] == "folder"]
+        assert sorted(mine) == ["arms/tests/pan.yaml", "tests/pan.yaml"]
+
+    run_ui([tmp_path], test)
+
+
 def test_problems_are_those_of_config_check(folder: Path) -> None:
     async def test(server: UiServer) -> None:
         found = await server.get("robots/check", robot="wrong.yaml", sim="false")

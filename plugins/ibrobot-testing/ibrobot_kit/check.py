@@ -15,6 +15,7 @@ from urllib.parse import unquote, urlsplit
 
 import attrs
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from ibrobot_core.api import MESSAGE_TYPES, Check, Descriptor, Late, MessageDescriptor, how_to_install, option
 from ibrobot_core.app import Registry, RequestError, Unsuccessful, echo, installed_plugins
@@ -138,8 +139,9 @@ def _versions(package: Distribution) -> Iterator[Check]:
 
 def _required(package: Distribution) -> list[str]:
     """The modules of the plugins that it requires, which discovery imports all the same."""
-    names = {Requirement(each).name for each in package.requires or () if "extra ==" not in each}
-    return sorted(point.module for point in entry_points(group="ibrobot") if point.dist and point.dist.name in names)
+    names = {canonicalize_name(Requirement(each).name) for each in package.requires or () if "extra ==" not in each}
+    points = entry_points(group="ibrobot")
+    return sorted(each.module for each in points if each.dist and canonicalize_name(each.dist.name) in names)
 
 
 def _weight(module: str, required: Sequence[str]) -> Check:

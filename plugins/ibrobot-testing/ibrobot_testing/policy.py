@@ -188,10 +188,10 @@ class PolicySuite(Suite[Policy]):
             before = copy.deepcopy(frame.values)
             inputs = policy.preprocess(frame)
             assert _equal(frame.values, before), "preprocess changed the frame"
-            before = copy.deepcopy(inputs)
+            before = copy.deepcopy(dict(inputs))
             outputs = policy.infer(inputs)
             assert _equal(inputs, before), "infer changed its input"
-            before = copy.deepcopy(outputs)
+            before = copy.deepcopy(dict(outputs))
             policy.postprocess(outputs)
             assert _equal(outputs, before), "postprocess changed its input"
 
@@ -207,9 +207,9 @@ class PolicySuite(Suite[Policy]):
         """What `preprocess` and `infer` returned does not change with the next request: requests overlap."""
         with self.loaded() as (policy, ctx):
             inputs = policy.preprocess(self.frame(policy, ctx, 1))
-            inputs_before = copy.deepcopy(inputs)
+            inputs_before = copy.deepcopy(dict(inputs))
             outputs = policy.infer(inputs)
-            outputs_before = copy.deepcopy(outputs)
+            outputs_before = copy.deepcopy(dict(outputs))
             policy.infer(policy.preprocess(self.frame(policy, ctx, 2)))
             assert _equal(inputs, inputs_before), "preprocess uses its output again"
             assert _equal(outputs, outputs_before), "infer uses its output again"
@@ -239,7 +239,7 @@ class PolicySuite(Suite[Policy]):
             if policy.spec.stateful:
                 pytest.skip("each request changes what it remembers")
             batch = [policy.preprocess(self.frame(policy, ctx, i)) for i in range(3)]
-            together = [copy.deepcopy(outputs) for outputs in policy.infer_batch(batch)]
+            together = [copy.deepcopy(dict(outputs)) for outputs in policy.infer_batch(batch)]
             assert len(together) == len(batch)
             for inputs, outputs in zip(batch, together, strict=True):
                 alone = policy.postprocess(policy.infer(inputs)).copy()
@@ -279,7 +279,7 @@ class PolicySuite(Suite[Policy]):
             if policy.spec.stateful:
                 pytest.skip("says that it remembers")
             inputs = policy.preprocess(self.frame(policy, ctx, 1))
-            first = copy.deepcopy(policy.infer(inputs))
+            first = copy.deepcopy(dict(policy.infer(inputs)))
             policy.infer(policy.preprocess(self.frame(policy, ctx, 2)))
             assert _equal(first, policy.infer(inputs))
 

@@ -101,7 +101,14 @@ def test_mistake_fails_with_its_cause(site: Site, old: str, new: str, name: str,
     assert message in f"{wrong[0].found}; {wrong[0].remedy}"
 
 
-@pytest.mark.parametrize(("requires", "is_light"), [(REQUIRES, False), (f"{REQUIRES}\nRequires-Dist: fake-base", True)])
+@pytest.mark.parametrize(
+    ("requires", "is_light"),
+    [
+        (REQUIRES, False),
+        (f"{REQUIRES}\nRequires-Dist: fake-base", True),
+        (f"{REQUIRES}\nRequires-Dist: Fake_Base", True),
+    ],
+)
 def test_what_a_required_plugin_imports_is_not_its_own_weight(site: Site, requires: str, *, is_light: bool) -> None:
     source = site.sources / "base.py"
     source.write_text("import numpy\n")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 
 import attrs
@@ -22,7 +22,7 @@ from ibrobot_core.api import (
     Vector,
     ns,
 )
-from ibrobot_core.app import ControlMode, RobotConfig, RunView, installed_plugins
+from ibrobot_core.app import ControlMode, RobotConfig, RunView
 from ibrobot_planning.execution.motions import commanded
 from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.grammar import GoalOptions
@@ -111,7 +111,7 @@ class GoalPlans:
         Raises:
             PlanningError: if the planner does not take such goals, or no executor of the mode can reach it.
         """
-        takes = tool_planners()
+        takes = tool_planners(self._session.registry.of_kind("planner"))
         assert self._mode.planner is not None
         of_tool = target.constraints is not None or not isinstance(target.tool, JointGoal | None)
         if of_tool and self._mode.planner.type not in takes:
@@ -298,9 +298,8 @@ class GoalPlans:
             raise PlanningError(f"the planner failed: {type(error).__name__}: {error}", PlanCode.FAILURE) from error
 
 
-def tool_planners() -> list[str]:
-    """The types of planners that take goals of the tool."""
-    planners = installed_plugins().of_kind("planner")
+def tool_planners(planners: Iterable[object]) -> list[str]:
+    """The types of planners that take goals of the tool, of the descriptors of planners."""
     return [each.type for each in planners if isinstance(each, PlannerDescriptor) and each.tool_goals]
 
 

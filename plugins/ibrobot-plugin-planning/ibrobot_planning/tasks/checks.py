@@ -50,6 +50,8 @@ class Situation:
     """Objects whose poses are not known yet."""
     held: str | None = None
     """What the gripper holds at the beginning."""
+    registry: Any = attrs.field(factory=installed_plugins, kw_only=True)
+    """The plugins; by default, those that are installed."""
 
 
 @attrs.frozen(eq=False)
@@ -77,7 +79,7 @@ def check_task(file: TaskFile, situation: Situation) -> CheckedTask:
 class _Checks:
     def __init__(self, file: TaskFile, situation: Situation) -> None:
         self._file, self._document, self._situation = file, file.document, situation
-        self._tool_planners = tool_planners()
+        self._tool_planners = tool_planners(situation.registry.of_kind("planner"))
         self._moved = set(situation.elsewhere)
         """Objects that have left the poses that the world has for them."""
         self._held = situation.held
@@ -327,7 +329,7 @@ class _Checks:
             self._available(key, step.mode)
         else:
             try:
-                check_models(config, installed_plugins(), [step.mode], step.prompt)
+                check_models(config, self._situation.registry, [step.mode], step.prompt)
             except IbrobotError as error:
                 self._document.add(key, str(error))
 

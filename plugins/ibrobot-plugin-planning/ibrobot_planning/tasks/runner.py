@@ -186,7 +186,9 @@ class TaskRunner(SessionWorker):
         world = session.bus.call(OBSERVED).world if session.bus.serves(OBSERVED) else None
         movable = [thing.name for thing in scene if thing.topic]
         start = session.state.command if session.state is not None else None
-        return check_task(file, Situation(config, world, movable, start, why, held=self._carried()))
+        return check_task(
+            file, Situation(config, world, movable, start, why, held=self._carried(), registry=self.session.registry)
+        )
 
     def _carried(self) -> str | None:
         """What the last task has left in the gripper, and the world still has there."""

@@ -26,7 +26,7 @@ _MOST = 200
 """Robot YAMLs that are listed."""
 _HEAD = 1 << 16
 """Bytes of a file in which `robot:` is found."""
-_SKIPPED = ("episodes", "datasets", "outputs", "tests")
+_SKIPPED = ("episodes", "datasets", "outputs")
 _PAGE = re.compile(r"viewer: (?P<url>https?://\S+)(?:\s+\(to watch only: (?P<watch_url>\S+)\))?")
 RUN_DONE = (0, 3)
 """Exit codes of runs that ended as they should; 3: not all episodes or goals succeeded."""
@@ -60,8 +60,9 @@ def _yamls(ui: Ui) -> Iterator[Path]:
 
 def _files(ui: Ui) -> Iterator[Path]:
     for parent, folders, names in ui.folders.walk(_DEPTH, _SKIPPED):
-        if "pyproject.toml" in names and parent not in ui.folders.paths:
-            folders.clear()
+        if "pyproject.toml" in names:  # of its sources, only an opened folder is looked through, without its tests
+            kept = set(folders) - {"tests"} if parent in ui.folders.paths else set()
+            folders[:] = [each for each in folders if each in kept]
         yield from (parent / name for name in sorted(names))
 
 
@@ -108,7 +109,7 @@ def _facts(config: RobotConfig) -> dict[str, Any]:
     devices = {
         f"{name}: {what}": device for name, each in hardware.items() for what, device in each.options.devices().items()
     }
-    modes = modes_json(config, terminal=False)
+    modes = modes_json(config, installed_plugins(), terminal=False)
     recording = config.recording
     return {
         "name": config.robot.name, "simulated": config.simulated, "joints": list(config.robot.joint_names),
