@@ -22,13 +22,18 @@ class SensorSuite(Suite[Sensor]):
 
     timeout_s: ClassVar[float] = 30.0
     """How long a check waits for an expected message [s]."""
+    measures_when_read: ClassVar[bool] = False
+    """Whether `read` itself measures, e.g. a register of a chip or a file, so that no message can be older."""
 
     def trigger(self, sensor: Sensor, ctx: Context) -> None:
         """Make the device capture again, at a later time; by default one control period passes."""
         ctx.clock.sleep_until(ctx.clock.now_ns() + ctx.period_ns)
 
     def silence(self, sensor: Sensor) -> None:
-        """Make the device stop capturing; override it for a device that captures without `trigger`."""
+        """Make the device stop capturing; override it for a device that captures without `trigger`.
+
+        No device stops whose `measures_when_read` is true.
+        """
 
     def opened(self, *, again: bool = False) -> AbstractContextManager[tuple[Sensor, Context]]:
         """An open sensor with its context; for `again` see `in_use`."""
@@ -71,14 +76,22 @@ class SensorSuite(Suite[Sensor]):
             self.trigger(sensor, ctx)
             self.silence(sensor)
             silent_ns = ctx.clock.now_ns()
-            ctx.clock.sleep_until(silent_ns + ctx.period_ns // 2)
+            ctx.clock.sleep_until(asked_ns := silent_ns + ctx.period_ns // 2)
             message: Any = sensor.read(0.01)
             if message is None:
                 pytest.skip("the device keeps no message that was not read")
-            assert message.header.stamp_ns <= silent_ns
+            stamp_ns = message.header.stamp_ns
+            if self.measures_when_read:
+                assert stamp_ns >= asked_ns, "the stamp is older than the measurement, which `read` makes"
+            else:
+                assert stamp_ns <= silent_ns, (
+                    "the stamp is not the time of capture; for a device that measures in `read`, set measures_when_read"
+                )
 
     def test_silence_gives_none(self) -> None:
         """A device that has stopped capturing returns None, never its last message with a new stamp."""
+        if self.measures_when_read:
+            pytest.skip("measures when it is read")
         with self.opened() as (sensor, ctx):
             self._next(sensor, ctx)
             self.silence(sensor)

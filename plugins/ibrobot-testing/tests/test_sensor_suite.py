@@ -11,7 +11,7 @@ import pytest
 from ibrobot_testing import SensorSuite, checks, failed_checks
 from ibrobot_testing.fakes import FakeImu, FakeSensor
 
-from ibrobot_core.api import CameraInfo, CompressedImage, Header, SensorError
+from ibrobot_core.api import CameraInfo, CompressedImage, Header, Imu, SensorError
 
 
 class TestSensor(SensorSuite):
@@ -21,6 +21,10 @@ class TestSensor(SensorSuite):
     def make(self, ctx):
         return FakeSensor(ctx)
 
+    @override
+    def silence(self, sensor):
+        sensor.silence()
+
 
 class TestImu(SensorSuite):
     timeout_s = 5.0
@@ -28,6 +32,10 @@ class TestImu(SensorSuite):
     @override
     def make(self, ctx):
         return FakeImu(ctx)
+
+    @override
+    def silence(self, sensor):
+        sensor.silence()
 
 
 class RelativeTopic(FakeSensor):
@@ -182,6 +190,54 @@ def test_catches(wrong, caught_by, tmp_path):
     assert caught_by in failed
     if wrong in ALONE:
         assert set(failed) == {caught_by}, "no other check catches it"
+
+
+class Thermometer(FakeImu):
+    """Measures when it is read, at most every 2 ms."""
+
+    late_ns = 0
+
+    def read(self, timeout_s):
+        if not self._open:
+            raise SensorError("not open")
+        clock = self._ctx.clock
+        clock.sleep_until(clock.now_ns() + 2_000_000)
+        return Imu(Header(clock.now_ns() - self.late_ns, "subject"))
+
+
+class StampsOfAnEarlierReading(Thermometer):
+    late_ns = 8_000_000
+
+
+@pytest.mark.parametrize(
+    ("device", "at_once", "failed"),
+    [
+        (Thermometer, True, set()),
+        (StampsOfAnEarlierReading, True, {"stamps_are_times_of_capture"}),
+        (Thermometer, False, {"stamps_are_times_of_capture", "silence_gives_none"}),
+    ],
+)
+def test_device_that_measures_when_it_is_read_says_so(device, at_once, failed, tmp_path):
+    class Suite(SensorSuite):
+        measures_when_read = at_once
+
+        @override
+        def make(self, ctx):
+            return device(ctx)
+
+    assert failed_checks(Suite, tmp_path) == failed
+
+
+def test_fake_waits_for_its_next_message_and_not_longer_than_its_time_out():
+    context = TestImu().context()
+    sensor = FakeImu(context)
+    sensor.open()
+    first = sensor.read(1.0)
+    assert sensor.read(0.004) is None
+    assert context.clock.now_ns() == first.header.stamp_ns + 4_000_000
+    second = sensor.read(1.0)
+    sensor.close()
+    assert second.header.stamp_ns == first.header.stamp_ns + context.period_ns == context.clock.now_ns()
 
 
 def test_every_check_catches_something():

@@ -27,6 +27,7 @@ from ibrobot_core.api import (
     Tensors,
     Vector3,
     Viewer,
+    ns,
     seconds,
 )
 from ibrobot_core.app import ControlMode, SourceWorker, StreamingRun, Subscription
@@ -49,6 +50,11 @@ class FakeSensor(Sensor):
         self._size = (height, width)
         self._open = False
         self._last_ns = -1
+        self._ends_ns: int | None = None
+
+    def silence(self) -> None:
+        """The device stops capturing."""
+        self._ends_ns = self._ctx.clock.now_ns()
 
     @override
     def open(self) -> None:
@@ -58,8 +64,12 @@ class FakeSensor(Sensor):
     def read(self, timeout_s: float) -> Image | None:
         if not self._open:
             raise SensorError(f"{self._ctx.name} is not open")
-        now_ns = self._ctx.clock.now_ns()
-        stamp_ns = now_ns - now_ns % self._ctx.period_ns
+        clock, period_ns = self._ctx.clock, self._ctx.period_ns
+        end_ns = clock.now_ns() + ns(timeout_s)
+        next_ns = end_ns if self._ends_ns is not None else self._last_ns + period_ns
+        clock.sleep_until(min(next_ns, end_ns))  # without it, the run's thread would ask all the time
+        captured_ns = clock.now_ns() if self._ends_ns is None else self._ends_ns
+        stamp_ns = captured_ns - captured_ns % period_ns
         if stamp_ns == self._last_ns:
             return None
         self._last_ns = stamp_ns
@@ -88,6 +98,11 @@ class FakeImu(Sensor):
         self._turning = turning
         self._open = False
         self._last_ns = -1
+        self._ends_ns: int | None = None
+
+    def silence(self) -> None:
+        """The device stops capturing."""
+        self._ends_ns = self._ctx.clock.now_ns()
 
     @override
     def open(self) -> None:
@@ -97,8 +112,12 @@ class FakeImu(Sensor):
     def read(self, timeout_s: float) -> Imu | None:
         if not self._open:
             raise SensorError(f"{self._ctx.name} is not open")
-        now_ns = self._ctx.clock.now_ns()
-        stamp_ns = now_ns - now_ns % self._ctx.period_ns
+        clock, period_ns = self._ctx.clock, self._ctx.period_ns
+        end_ns = clock.now_ns() + ns(timeout_s)
+        next_ns = end_ns if self._ends_ns is not None else self._last_ns + period_ns
+        clock.sleep_until(min(next_ns, end_ns))  # without it, the run's thread would ask all the time
+        captured_ns = clock.now_ns() if self._ends_ns is None else self._ends_ns
+        stamp_ns = captured_ns - captured_ns % period_ns
         if stamp_ns == self._last_ns:
             return None
         self._last_ns = stamp_ns
