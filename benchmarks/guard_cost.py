@@ -1,9 +1,11 @@
 """What the guard costs: the time of a check by the number of bodies, the lateness of the loop, and floods of changes.
 
-    python benchmarks/guard_cost.py [--ticks 2000] [--pairs 6] [--seconds 10] [--parts checks changes lateness floods]
+    python benchmarks/guard_cost.py [--ticks 2000] [--pairs 6] [--seconds 10]
+        [--parts checks memory changes lateness floods]
 
 `checks`: an SO-101 moves among 5 to 500 boxes, and in a point cloud of 20,000 cells around it, aimed at contacts;
-median and 99th percentile of the processor time of a tick in the safety layer. `changes`: processor time from a change
+median and 99th percentile of the processor time of a tick in the safety layer. `memory`: what a tick among 20 boxes
+allocates and keeps, and its processor time with garbage collection and without. `changes`: processor time from a change
 of a world of 20 boxes until the loop can have it, for one SO-101 and for two. `lateness`: in real time, runs of the
 simulated SO-101 with 20 objects around it, with the guard and without, by turns; how late ticks begin, and the load of
 the machine. `floods`: in such runs, 200 objects are added within 4 s, an object moves 200 times a second, meshes of
@@ -15,6 +17,7 @@ flood has control miss more ticks than the same run without it.
 from __future__ import annotations
 
 import argparse
+import gc
 import itertools
 import logging
 import os
@@ -24,7 +27,9 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+import tracemalloc
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +47,7 @@ BODIES = (5, 20, 100, 500)
 CELLS, CELL_M = 20_000, 0.01
 ALLOWED_RATIO = 1.3
 TWO_TICKS_MS = 20.0
-PARTS = ("checks", "changes", "lateness", "floods")
+PARTS = ("checks", "memory", "changes", "lateness", "floods")
 
 
 def places(count: int, rng: np.random.Generator) -> dict[str, tuple[float, float, float]]:
@@ -70,26 +75,61 @@ def cloud(rng: np.random.Generator, cells: int = CELLS) -> WorldObject:
     return WorldObject(Voxels(CELL_M, nearest[order[:cells]]))
 
 
-def check_times(
+def aimed(
     station: Station, judge: Judge, world: Mapping[str, WorldObject], ticks: int
-) -> tuple[list[float], int]:
-    """Processor time of each tick of the safety layer with the guard [ms], and how many of them it changed."""
+) -> Iterator[tuple[Loop, Callable[[], object]]]:
+    """The safety layer with the guard, and what has it take a tick with the next command of changing commanders."""
     rng = np.random.default_rng(0)
     judge.put({})
     loop = Loop(station, np.zeros(len(station.robot.joints)))
     loop.world(WorldChange(dict(world)))
-    commanders, took_ms, overruled = guard_trials.Commanders(station, judge, rng), [], 0
-    stream = commanders.stream("policy", loop.position)
+    commanders = guard_trials.Commanders(station, judge, rng)
     for tick in range(ticks):
         if tick % 50 == 0:
             kind = str(rng.choice(commanders.KINDS))
             stream = commanders.stream(kind, loop.position)
-        wanted = next(stream)
+        yield loop, partial(loop.tick, next(stream))
+
+
+def check_times(
+    station: Station, judge: Judge, world: Mapping[str, WorldObject], ticks: int
+) -> tuple[list[float], int]:
+    """Processor time of each tick of the safety layer with the guard [ms], and how many of them it changed."""
+    took_ms, overruled = [], 0
+    for loop, tick in aimed(station, judge, world, ticks):
         begun_s = time.thread_time()
-        loop.tick(wanted)
+        tick()
         took_ms.append(1e3 * (time.thread_time() - begun_s))
         overruled += bool(loop.overruled)
     return took_ms, overruled
+
+
+def memory(ticks: int) -> dict[str, float]:
+    """What a tick allocates and keeps, and whether garbage collection, which control switches off, costs time."""
+    world = boxes(20, np.random.default_rng(1))
+    with tempfile.TemporaryDirectory() as folder:
+        station = guard_trials.stations(Path(folder))["so101"]
+        judge, most, kept = Judge(station), list[float](), list[float]()
+        tracemalloc.start()
+        for _, tick in aimed(station, judge, world, 1 + ticks // 10):
+            before = tracemalloc.get_traced_memory()[0]
+            tracemalloc.reset_peak()
+            tick()
+            after, peak = tracemalloc.get_traced_memory()
+            most.append((peak - before) / 1024)
+            kept.append((after - before) / 1024)
+        tracemalloc.stop()
+        # The first tick takes over the world.
+        figures = {"allocates_median_kib": statistics.median(most[1:]), "allocates_most_kib": max(most[1:])}
+        figures["keeps_mean_kib"] = statistics.mean(kept[1:])
+        for name, begin in (("collected", gc.enable), ("uncollected", gc.disable)):
+            begin()
+            took_ms, _ = check_times(station, judge, world, ticks)
+            gc.enable()
+            figures[f"tick_{name}_p99_ms"] = float(np.percentile(took_ms, 99))
+    for key, value in figures.items():
+        print(f"{key}: {value:.3g}", flush=True)
+    return figures
 
 
 def checks(ticks: int) -> dict[str, float]:
@@ -289,6 +329,8 @@ def main() -> int:
     figures: dict[str, float] = {}
     if "checks" in asked.parts:
         figures |= checks(asked.ticks)
+    if "memory" in asked.parts:
+        figures |= memory(asked.ticks)
     if "changes" in asked.parts:
         figures |= changes()
     if "lateness" in asked.parts:

@@ -99,6 +99,35 @@ def test_commands_drive_a_simulated_robot(run: Callable[..., None], tmp_path: Pa
     run("teleoperate", *ROBOT, *WAVING, "--fps=30", "--teleop_time_s=1")
 
 
+def test_the_guard_stops_what_a_program_of_lerobot_sends(run: Callable[..., None], tmp_path: Path) -> None:
+    """The wave goes 17 degrees to either side; a wall beside the hand leaves less of one."""
+    wall = "world.objects={wall: {shape: box, size: [0.3, 0.02, 0.3], position: [0.3, 0.09, 0.15]}}"
+    farthest = {}
+    for name, more in (("guarded", ()), ("unguarded", ("control.guard=null",))):
+        dataset = tmp_path / name
+        overrides = ["simulation={type: mujoco, scene: empty, start_pose: home}", wall, *more]
+        run(
+            "record",
+            *ROBOT,
+            f"--robot.overrides={overrides}",
+            *WAVING,
+            f"--dataset.repo_id=me/{name}",
+            f"--dataset.root={dataset}",
+            "--dataset.num_episodes=1",
+            "--dataset.episode_time_s=3",
+            "--dataset.reset_time_s=0",
+            "--dataset.single_task=wave",
+            "--dataset.push_to_hub=false",
+            "--play_sounds=false",
+        )
+        actions, states = column(dataset, "action")[:, 0], column(dataset, STATE)[:, 0]
+        assert (actions.min(), actions.max()) == pytest.approx((-17.2, 17.2), abs=1.5)
+        farthest[name] = states.min(), states.max()
+    assert farthest["unguarded"] == pytest.approx((-17.2, 17.2), abs=3.0)
+    assert np.abs(np.subtract(farthest["guarded"], farthest["unguarded"])).max() > 4.0, "the wall stops nothing"
+    assert np.abs(np.subtract(farthest["guarded"], farthest["unguarded"])).min() < 1.0, "the way back is free"
+
+
 def test_rollout_drives_a_simulated_robot_with_cameras(run: Callable[..., None], tmp_path: Path) -> None:
     """A policy of the features that a dataset from LeRobot's own so101_follower with these cameras has."""
     shapes = {STATE: (SIZE,), TOP: (3, 240, 320), WRIST: (3, 240, 320)}
