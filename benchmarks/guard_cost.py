@@ -21,6 +21,7 @@ import gc
 import itertools
 import logging
 import os
+import resource
 import statistics
 import struct
 import sys
@@ -104,29 +105,35 @@ def check_times(
     return took_ms, overruled
 
 
+def resident_kib() -> int:
+    """Memory of this process that is in use [KiB]."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() // 1024
+
+
 def memory(ticks: int) -> dict[str, float]:
     """What a tick allocates and keeps, and whether garbage collection, which control switches off, costs time."""
     world = boxes(20, np.random.default_rng(1))
     with tempfile.TemporaryDirectory() as folder:
         station = guard_trials.stations(Path(folder))["so101"]
-        judge, most, kept = Judge(station), list[float](), list[float]()
+        judge, most = Judge(station), list[float]()
         tracemalloc.start()
         for _, tick in aimed(station, judge, world, 1 + ticks // 10):
             before = tracemalloc.get_traced_memory()[0]
             tracemalloc.reset_peak()
             tick()
-            after, peak = tracemalloc.get_traced_memory()
-            most.append((peak - before) / 1024)
-            kept.append((after - before) / 1024)
+            most.append((tracemalloc.get_traced_memory()[1] - before) / 1024)
         tracemalloc.stop()
         # The first tick takes over the world.
         figures = {"allocates_median_kib": statistics.median(most[1:]), "allocates_most_kib": max(most[1:])}
-        figures["keeps_mean_kib"] = statistics.mean(kept[1:])
-        for name, begin in (("collected", gc.enable), ("uncollected", gc.disable)):
-            begin()
-            took_ms, _ = check_times(station, judge, world, ticks)
-            gc.enable()
-            figures[f"tick_{name}_p99_ms"] = float(np.percentile(took_ms, 99))
+        figures["tick_collected_p99_ms"] = float(np.percentile(check_times(station, judge, world, ticks)[0], 99))
+        gc.disable()
+        figures["tick_uncollected_p99_ms"] = float(np.percentile(check_times(station, judge, world, ticks)[0], 99))
+        for number, (_, tick) in enumerate(aimed(station, judge, world, ticks)):
+            tick()
+            if number == ticks // 2:
+                half_kib = resident_kib()
+        figures["uncollected_grows_kib"] = resident_kib() - half_kib
+        gc.enable()
     for key, value in figures.items():
         print(f"{key}: {value:.3g}", flush=True)
     return figures
