@@ -11,6 +11,7 @@ import cv2
 import pytest
 from click.testing import CliRunner
 from ibrobot_camera import v4l2
+from ibrobot_camera.commands import calibrate
 from ibrobot_testing import ibrobot_command
 from ibrobot_testing.command import command_line
 from stream_server import StreamServer
@@ -22,7 +23,10 @@ camera = command_line("camera")
 
 ROBOT = """
 robot: {{name: r, joints: [{{name: j, lower: -1, upper: 1, max_velocity: 1, max_acceleration: 5}}], groups: {{a: [j]}}}}
-hardware: {{type: nothing}}
+simulation: {{type: fake}}
+executors: {{arm: {{type: position, group: a}}}}
+control_modes: {{still: {{executors: [arm]}}}}
+default_control_mode: still
 peripherals:
   - {{name: top, kind: camera, type: opencv, device: "{url}"}}
   - {{name: wrist, kind: camera, type: opencv, device: "{url}"}}
@@ -65,6 +69,23 @@ def test_snapshot_saves_the_picture_and_says_its_rate(tmp_path: Path) -> None:
     saved = cv2.imread(str(tmp_path / "a.png"))
     assert saved is not None
     assert saved.shape == (48, 64, 3)
+
+
+def test_a_calibration_opens_only_the_camera_that_it_measures(tmp_path: Path) -> None:
+    robot = tmp_path / "robot.yaml"
+    with StreamServer() as server:
+        robot.write_text(ROBOT.format(url=server.url).replace(server.url, "/dev/video77", 1))
+        with calibrate.camera(str(robot), "wrist") as (name, read):
+            picture = read(10.0)
+    assert name == "wrist"
+    assert picture is not None
+    assert picture.shape == (48, 64, 3)
+    for named, message in (
+        ("", r"has several cameras \(top, wrist\)"),
+        ("side", r"no opencv camera 'side'; it has: top, "),
+    ):
+        with pytest.raises(RequestError, match=message), calibrate.camera(str(robot), named):
+            raise AssertionError("it opened")
 
 
 def test_snapshot_refuses_what_it_cannot_write() -> None:

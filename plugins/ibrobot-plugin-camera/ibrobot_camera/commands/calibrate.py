@@ -17,7 +17,7 @@ from ibrobot_camera.intrinsics.board import PAPERS, Board
 from ibrobot_camera.intrinsics.solve import FEWEST_VIEWS, Intrinsics, solve
 from ibrobot_camera.intrinsics.views import View, Views, find
 from ibrobot_core.api import SensorError, option
-from ibrobot_core.app import RequestError, echo, wrong_input
+from ibrobot_core.app import echo, wrong_input
 
 VIEWS = 20
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
@@ -127,20 +127,16 @@ def camera(source: str, name: str = "") -> Iterator[tuple[str, Read]]:
     """Open one camera; yields its name and a function that reads pictures.
 
     Raises:
-        SensorError: if it does not open, or the robot YAML has several cameras and `name` is none of them.
+        SensorError: if it does not open.
+        RequestError: if the robot YAML has no camera `name`, or several and `name` is empty.
     """
     from ibrobot_camera.commands.sources import decoded, opened, pixels
 
-    with opened(source) as cameras:
-        known = ", ".join(cameras)
-        if name and name not in cameras:
-            raise RequestError(f"--camera: {source} has no opencv camera {name!r}; it has: {known}")
-        if not name and len(cameras) > 1:
-            raise RequestError(f"{source} has several cameras ({known}): name one with --camera")
-        name = name or next(iter(cameras))
+    with opened(source, name) as cameras:
+        ((name, opened_camera),) = cameras.items()
 
         def read(timeout_s: float) -> NDArray[np.uint8] | None:
-            message = cameras[name].read(timeout_s)
+            message = opened_camera.read(timeout_s)
             return None if message is None else np.asarray(pixels(decoded(message)), np.uint8)
 
         yield name, read

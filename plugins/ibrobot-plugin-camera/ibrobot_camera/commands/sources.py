@@ -14,7 +14,7 @@ from ibrobot_camera.camera import OpenCvCamera, to_image
 from ibrobot_camera.capture import Pixels
 from ibrobot_camera.options import OpenCvOptions
 from ibrobot_core.api import CompressedImage, Context, Image, RealClock, Robot, SensorError
-from ibrobot_core.app import find_config, installed_plugins, load_config, wrong_input
+from ibrobot_core.app import RequestError, find_config, installed_plugins, load_config, wrong_input
 
 _UNNAMED = "camera"
 _QUALITY = 80
@@ -22,17 +22,23 @@ _TO_BGR = {"bgr8": None, "rgb8": cv2.COLOR_RGB2BGR, "mono8": cv2.COLOR_GRAY2BGR}
 
 
 @contextmanager
-def opened(source: str) -> Iterator[dict[str, OpenCvCamera]]:
+def opened(source: str, one: str | None = None) -> Iterator[dict[str, OpenCvCamera]]:
     """Open the cameras of a device or a robot YAML; yields name -> camera.
+
+    Args:
+        source: a device or the path of a robot YAML.
+        one: the name of the only camera to open; empty for the only one that there is; None to open all.
 
     Raises:
         ConfigError: if the robot YAML has mistakes.
+        RequestError: if the robot YAML has no camera `one`, or several and `one` is empty.
         SensorError: if a camera does not open, or the YAML has none.
     """
     clock = RealClock()
     with ExitStack() as stack:
         cameras = {}
-        for name, options in _options(source).items():
+        by_name = _options(source)
+        for name, options in (by_name if one is None else _only(source, by_name, one)).items():
             ctx = Context(name, clock, logging.getLogger(f"ibrobot.{name}"), Robot("camera", ()))
             camera = OpenCvCamera(options, ctx)
             with wrong_input():
@@ -59,6 +65,15 @@ def _options(source: str) -> dict[str, OpenCvOptions]:
     if not by_name:
         raise SensorError(f"{source}: has no camera of type opencv")
     return by_name
+
+
+def _only(source: str, by_name: dict[str, OpenCvOptions], name: str) -> dict[str, OpenCvOptions]:
+    known = ", ".join(by_name)
+    if name and name not in by_name:
+        raise RequestError(f"--camera: {source} has no opencv camera {name!r}; it has: {known}")
+    if not name and len(by_name) > 1:
+        raise RequestError(f"{source} has several cameras ({known}): name one with --camera")
+    return {name: by_name[name]} if name else by_name
 
 
 def decoded(message: Image | CompressedImage) -> Image:

@@ -40,7 +40,8 @@ export class Motion {
     if (!page.jogs.length) {
       const driven = status.robot.modes.filter(({ jogs, unavailable }) => Object.keys(jogs).length && !unavailable);
       const here = Object.keys(page.mode?.jogs ?? {}).length;
-      const how = here ? (page.operating ? "Reset the fault to jog." : "Only the page that operates can jog.")
+      const how = !page.operating ? "Only the page that operates can jog."
+        : here ? "Reset the fault to jog."
         : driven.length ? `To jog from here, choose the mode “${driven[0].label}”.`
           : "To jog from here, the robot needs a mode whose teleop is of type web.";
       return [h("p", { class: "note" }, how), status.help && !here ? h("pre", {}, status.help) : null].filter(Boolean);
