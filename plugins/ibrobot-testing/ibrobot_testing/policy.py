@@ -196,9 +196,14 @@ class PolicySuite(Suite[Policy]):
             assert _equal(outputs, before), "postprocess changed its input"
 
     def test_outputs_stay_as_they_were(self) -> None:
-        """A chunk does not change when the next one is computed."""
+        """A chunk does not change when the next one is computed, nor with the frame and tensors that it was made of."""
         with self.loaded() as (policy, ctx):
-            chunk = policy.postprocess(policy.infer(policy.preprocess(self.frame(policy, ctx, 1))))
+            frame = self.frame(policy, ctx, 1)
+            inputs = policy.preprocess(frame)
+            outputs = policy.infer(inputs)
+            chunk = policy.postprocess(outputs)
+            for name, array in (*frame.values.items(), *inputs.items(), *outputs.items()):
+                assert not np.shares_memory(chunk, array), f"the chunk is a view of {name}: return a copy"
             before = chunk.copy()
             policy.postprocess(policy.infer(policy.preprocess(self.frame(policy, ctx, 2))))
             np.testing.assert_array_equal(chunk, before)

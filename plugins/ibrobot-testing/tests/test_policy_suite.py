@@ -171,6 +171,33 @@ class ReusesItsChunk(FakePolicy):
         return self.chunk
 
 
+class ReturnsAView(FakePolicy):
+    """Of the outputs, which the next `infer`, or what carries them between processes, may overwrite."""
+
+    def infer(self, tensors):
+        return {"plan": FakePolicy.postprocess(self, super().infer(tensors))}
+
+    def postprocess(self, tensors):
+        return tensors["plan"].view()
+
+
+class ReturnsTheFrame(FakePolicy):
+    """Stays where it is, by a view of the observation itself."""
+
+    def __init__(self, ctx):
+        super().__init__(ctx)
+        self.spec = attrs.evolve(self.spec, chunk_size=1)
+
+    def preprocess(self, frame):
+        return {"state": frame.observation("observation.state", (self.spec.action_size,))}
+
+    def infer(self, tensors):
+        return tensors
+
+    def postprocess(self, tensors):
+        return tensors["state"][None]
+
+
 class CountsPreprocess(FakePolicy):
     count = 0
 
@@ -303,6 +330,8 @@ WRONG = {
     ChangesTheFrame: "inputs_stay_as_they_were",
     NormalisesInPlace: "inputs_stay_as_they_were",
     ReusesItsChunk: "outputs_stay_as_they_were",
+    ReturnsAView: "outputs_stay_as_they_were",
+    ReturnsTheFrame: "outputs_stay_as_they_were",
     ReusesItsOutputs: "outputs_of_each_step_stay_as_they_were",
     CountsPreprocess: "pre_and_postprocess_are_pure",
     SendsObjects: "tensors_survive_the_wire",

@@ -155,7 +155,7 @@ class ScriptedExpert(Policy):
 
     @override
     def postprocess(self, tensors: Tensors) -> NDArray[np.float64]:
-        positions = np.asarray(tensors[ACTION], dtype=np.float64)
+        positions = np.array(tensors[ACTION], dtype=np.float64)
         if self._options.actions == "joints":
             return positions
         if self._arm is None:
