@@ -8,6 +8,7 @@ import fcntl
 import json
 import os
 import re
+import resource
 import shlex
 import shutil
 import sys
@@ -90,6 +91,8 @@ IS_FIRST = "NOX_NOT_TESTED" not in os.environ
 """Whether this process started the others: those that run one session each, side by side."""
 NOT_TESTED = Path(os.environ.setdefault("NOX_NOT_TESTED", str(Path(f".nox/not-tested-{os.getpid()}").absolute())))
 """The file of what no session could test on this machine, and what to do about it."""
+PROCESSOR = Path(os.environ.setdefault("NOX_PROCESSOR", str(Path(f".nox/processor-{os.getpid()}").absolute())))
+"""The file of how much time of processors each session took."""
 if not IS_FIRST and "integration" not in sys.argv:
     # All others end beside the longest one if they leave the processor to it. Linux shares the processor among the
     # sessions of processes first, and each of nox is one.
@@ -180,6 +183,21 @@ def list_what_was_not_tested() -> None:
         for line in NOT_TESTED.read_text(encoding="utf-8").splitlines():
             print(f"nox > {line}", file=sys.stderr)
         NOT_TESTED.unlink()
+
+
+@atexit.register
+def list_processor_time() -> None:
+    """After all sessions: the processor time of each, with its environment and all processes that it started."""
+    used = sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
+    if not IS_FIRST:
+        name = next(sys.argv[i + 1] for i, each in enumerate(sys.argv) if each in ("-s", "--session", "--sessions"))
+        with PROCESSOR.open("a", encoding="utf-8") as file:
+            file.write(f"{used:.0f} {name}\n")
+    elif PROCESSOR.exists():
+        each = sorted(map(str.split, PROCESSOR.read_text(encoding="utf-8").splitlines()), key=lambda row: -int(row[0]))
+        listed = ", ".join(f"{name} {seconds}" for seconds, name in each)
+        print(f"nox > processor: {used:.0f} s in all; {listed}", file=sys.stderr)
+        PROCESSOR.unlink()
 
 
 def installation(page: str) -> list[str]:

@@ -106,7 +106,12 @@ from ibrobot_core.events import (
     Failed as Failed,
     Shown as Shown,
 )
-from ibrobot_core.safe_output import echo as echo, printable as printable, LogFormatter as LogFormatter
+from ibrobot_core.safe_output import (
+    echo as echo,
+    printable as printable,
+    UNPRINTABLE as UNPRINTABLE,
+    LogFormatter as LogFormatter,
+)
 from ibrobot_core.cli.display import RunDisplay as RunDisplay, RunTerminal as RunTerminal
 from ibrobot_core.signals import on_signals as on_signals, end_signals as end_signals
 

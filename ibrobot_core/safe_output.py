@@ -19,7 +19,7 @@ from ibrobot_core.options import HIDDEN
 
 _CONTROL = "\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ud800-\udfff\U000e0000-\U000e0fff"
 _UNSEEN = "\xad\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\ufeff\uffa0\ufff0-\ufffb"
-_UNPRINTABLE = re.compile(f"[{_CONTROL}{_UNSEEN}]")
+UNPRINTABLE = re.compile(f"[{_CONTROL}{_UNSEEN}]")
 """Control characters except tab and line feed, those that change the text direction or show nothing, so that two names
 would look the same, and lone surrogates."""
 _CREDENTIALS = re.compile(r"(?P<scheme>\b[A-Za-z][A-Za-z0-9+.-]*://)[^\s/?#]*@")
@@ -56,7 +56,7 @@ def printable(text: str) -> str:
     Unprintable characters are escaped as in JSON and YAML, e.g. `\u001b`, and secrets hidden.
     """
     text = redacted(text).replace("`ibrobot ", _TYPED)
-    return _UNPRINTABLE.sub(lambda match: ("\\u%04x" if match[0] < "\U00010000" else "\\U%08x") % ord(match[0]), text)
+    return UNPRINTABLE.sub(lambda match: ("\\u%04x" if match[0] < "\U00010000" else "\\U%08x") % ord(match[0]), text)
 
 
 def echo(message: object = "", *, err: bool = False, nl: bool = True) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from ibrobot_core.errors import EXTRAS
-from ibrobot_core.plugins import KINDS, OFFICIAL, example_type, official_plugins
+from ibrobot_core.plugins import KINDS, OFFICIAL, RECORDS, example_type, official_plugins
 
 CORE = OFFICIAL.parent
 ORDINARY = {"calibrated", "gripper", "imu", "joint", "keyboard", "panel", "process", "processes", "trajectory", "twist"}
@@ -74,6 +74,15 @@ def test_official_plugins_are_listed_as_they_are() -> None:
         pytest.fail(f"not installed: {', '.join(lacking)}; run uv sync --group cluster")
     assert offers() == official_plugins(), "run python tests/house/official_plugins.py"
     assert extras() == json.loads(EXTRAS.read_bytes()), "run python tests/house/official_plugins.py"
+
+
+def test_no_two_packages_of_this_project_offer_the_same() -> None:
+    owners: dict[tuple[str, str], list[str]] = {}
+    for package, offers in official_plugins().items():
+        for kind in offers.keys() - {"default", RECORDS, "job"}:
+            for type_ in offers[kind]:
+                owners.setdefault((kind, type_), []).append(package)
+    assert {each: packages for each, packages in owners.items() if len(packages) > 1} == {}, "messages name only one"
 
 
 def test_plugins_that_are_not_installed_are_named() -> None:
