@@ -252,6 +252,11 @@ def test_one_operates_the_other_watches_and_takes_over(chromium: Any, address: s
     try:
         assert "watching" in other.text("#operator")
         assert other.page.locator("#thumb").is_hidden()
+        tab.enter("plan motions", "moveit_planning")
+        other.until(lambda: other.ask("ibrobot.status.mode") == "moveit_planning")
+        other.until(lambda: "Only the page that operates can jog." in other.text("#motion"))
+        tab.enter("drive from the page", "web")
+        other.until(lambda: other.ask("ibrobot.status.mode") == "web")
         assert other.page.get_by_role("button", name="End the run", exact=True).is_disabled()
         assert other.page.locator(".joint .jog:visible, .joint :enabled, #motion button, #mode :enabled").count() == 0
         other.page.get_by_role("button", name="Take over").click()
