@@ -111,6 +111,52 @@ def test_an_episode_that_cannot_tell_is_refused_with_the_reason(
     assert robot.read_text() == before
 
 
+def answers(robot: Path | str, episode: Path, **changes: str | bool) -> dict[str, str | bool]:
+    """Of an operator on the page."""
+    return {
+        "robot": str(robot), "episode": str(episode), "camera": "wrist", "on": "gripper_link", "board_on": "",
+        "squares": "8 x 6", "square": "25", "simulated": False, **changes,
+    }  # fmt: skip
+
+
+def test_the_page_measures_the_same_and_writes_it_if_the_operator_agrees(recorded: Path, robot: Path) -> None:
+    from ibrobot_camera.commands.mount import guided, questions
+    from ibrobot_terminal.fakes import FakeGuide
+
+    assert {each.name for each in questions()} == set(answers(robot, recorded))
+    guide = FakeGuide()
+    guided(answers(robot, recorded / "good"), guide)
+    assert any("cross-validation" in text for text in guide.said)
+    assert guide.said[-1] == f"{robot}: the mount of wrist is written"
+    (transform,) = [each.get("transform") for each in yaml.safe_load(robot.read_text())["peripherals"][1:]]
+    assert str(transform["xyz"]) in " ".join(guide.said)
+    shipped = FakeGuide()
+    guided(answers("so101", recorded / "good"), shipped)
+    assert shipped.said[-1].startswith("This robot is shipped with ibrobot")
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"squares": "8"}, "give its squares as 10 x 7"),
+        ({"squares": "8 x 99"}, "give its squares as 10 x 7"),
+        ({"square": "wide"}, "give its squares as 10 x 7"),
+        ({"on": "gripper"}, "has no link 'gripper'"),
+        ({"camera": "side"}, "has no camera 'side'; it has: top, wrist"),
+    ],
+)
+def test_wrong_answers_are_named(recorded: Path, robot: Path, changes: dict[str, str], reason: str) -> None:
+    from ibrobot_camera.commands.mount import guided
+    from ibrobot_terminal.fakes import FakeGuide
+
+    from ibrobot_core.errors import IbrobotError
+
+    before = robot.read_text()
+    with pytest.raises(IbrobotError, match=reason):
+        guided(answers(robot, recorded / "good", **changes), FakeGuide())
+    assert robot.read_text() == before
+
+
 def test_a_shipped_robot_is_not_written(recorded: Path) -> None:
     code, output = run("so101", str(recorded / "good"), "--camera", "wrist", "--on", "gripper_link", "--write")
     assert code != 0

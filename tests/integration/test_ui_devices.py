@@ -59,7 +59,7 @@ def test_an_arm_is_calibrated_on_the_page(tmp_path: Path, monkeypatch: pytest.Mo
 
     async def test(server: UiServer) -> None:
         guides = {each["name"]: each for each in (await server.get("devices/list"))["guides"]}
-        order = ["ports", "port", "motors", "calibration", "servos", "cameras", "lens"]
+        order = ["ports", "port", "motors", "calibration", "servos", "cameras", "lens", "mount"]
         assert [name for name in guides if name in order] == order  # as a person sets up an arm
         questions = [each["name"] for each in guides["calibration"]["questions"]]
         assert questions == ["port", "leader", "name", "zero_at", "auto"]

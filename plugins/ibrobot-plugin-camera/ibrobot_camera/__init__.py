@@ -76,6 +76,14 @@ def ibrobot_guides() -> Iterable[GuideDescriptor]:
         make=Late("ibrobot_camera.commands.calibrate:guided"),
         questions=Late("ibrobot_camera.commands.calibrate:questions"),
     )
+    yield GuideDescriptor(
+        "mount",
+        order=75,
+        label="Measure where a camera is mounted",
+        summary="From a recording in which the camera sees the board of its calibration while the arm turns.",
+        make=Late("ibrobot_camera.commands.mount:guided"),
+        questions=Late("ibrobot_camera.commands.mount:questions"),
+    )
 
 
 @hookimpl

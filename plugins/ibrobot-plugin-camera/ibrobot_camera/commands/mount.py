@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from ibrobot_kinematics.poses import homogeneous
 from ibrobot_kinematics.rotations import from_rpy, quaternion
 from ibrobot_kinematics.urdf import Urdf, read_urdf
 from ibrobot_provenance.files import replace_file
+from ibrobot_terminal import Guide, Question
 
 from ibrobot_camera.calibration import load_info
 from ibrobot_camera.intrinsics.board import Board
@@ -22,6 +24,42 @@ from ibrobot_camera.mounting.solve import Mounting, solve_mount
 from ibrobot_camera.options import OpenCvOptions
 from ibrobot_core.api import CameraInfo, Header, IbrobotError, SensorError, Vector, option
 from ibrobot_core.app import RequestError, RobotConfig, echo, find_config, installed_plugins, load_config, wrong_input
+
+
+@attrs.frozen(eq=False)
+class Found:
+    """Where a camera is mounted, and the robot YAML that this belongs into."""
+
+    source: Path
+    camera: str
+    link: str
+    mounting: Mounting
+
+    @property
+    def line(self) -> str:
+        """What the robot YAML says of it."""
+        return f"transform: {{parent: {self.link}, xyz: {list(self.mounting.xyz)}, rpy: {list(self.mounting.rpy)}}}"
+
+    def save(self) -> None:
+        """Put it into the robot YAML, and keep the rest as it is.
+
+        Raises:
+            SensorError: if that cannot be written.
+        """
+        values: dict[str, str | tuple[float, ...]] = {"parent": self.link, "xyz": self.mounting.xyz}
+        mount = load_config(self.source).peripherals[self.camera].transform
+        if mount is not None and mount.quaternion is not None:
+            turn = quaternion(self.mounting.place[:3, :3])
+            values["quaternion"] = tuple(round(float(each), 6) for each in turn)
+        else:
+            values["rpy"] = self.mounting.rpy
+        try:
+            text = self.source.read_bytes().decode()
+            replace_file(self.source, with_transform(text, self.camera, values))
+        except IbrobotError as error:
+            raise SensorError(f"{self.source}: {error}") from None
+        except (OSError, UnicodeDecodeError) as error:
+            raise SensorError(f"{self.source}: cannot be written: {error}") from None
 
 
 @attrs.frozen(kw_only=True)
@@ -53,6 +91,20 @@ class MountCamera(Board):
 
     @wrong_input()
     def __call__(self) -> Mounting:
+        found = self.found()
+        if self.write:
+            found.save()
+            echo(f"{found.source}: the mount of {found.camera} is written")
+        else:
+            echo(f"  {found.line}")
+        return found.mounting
+
+    def found(self) -> Found:
+        """The mount, which is not written.
+
+        Raises:
+            IbrobotError: if the robot or an episode cannot be read, or cannot tell the mount.
+        """
         source = find_config(self.robot, installed_plugins())
         config = load_config(source, sim=self.sim)
         camera = _camera(config, self.camera)
@@ -81,13 +133,7 @@ class MountCamera(Board):
             shots += taken.shots
             told.append(taken.text())
         assert lens is not None
-        result = solve_mount(Session(shots, chain, lens, measured), f": {'; '.join(told)}")
-        if self.write:
-            _write(source, camera, link, result)
-            echo(f"{source}: the mount of {camera} is written")
-        else:
-            echo(f"  transform: {{parent: {link}, xyz: {list(result.xyz)}, rpy: {list(result.rpy)}}}")
-        return result
+        return Found(source, camera, link, solve_mount(Session(shots, chain, lens, measured), f": {'; '.join(told)}"))
 
     def show(self, result: Mounting) -> None:
         """Print the result."""
@@ -137,17 +183,42 @@ def _info(config: RobotConfig, camera: str) -> CameraInfo | None:
     return load_info(path)(Header()) if path is not None else None
 
 
-def _write(source: Path, camera: str, link: str, result: Mounting) -> None:
-    values: dict[str, str | tuple[float, ...]] = {"parent": link, "xyz": result.xyz}
-    mount = load_config(source).peripherals[camera].transform
-    if mount is not None and mount.quaternion is not None:
-        values["quaternion"] = tuple(round(float(each), 6) for each in quaternion(result.place[:3, :3]))
-    else:
-        values["rpy"] = result.rpy
+def questions() -> tuple[Question, ...]:
+    """Of the guide for pages."""
+    return (
+        Question("robot", "Robot YAML", "so101"),
+        Question("episode", "Recorded episode in which the camera sees the board", "episodes/board:0"),
+        Question("camera", "Camera", "wrist"),
+        Question("on", "Link that carries the camera", "gripper_link"),
+        Question("board_on", "Link that carries the board; empty for the base"),
+        Question("squares", "Squares of the board, columns x rows", "10 x 7"),
+        Question("square", "Side of a square of the printed board [mm]", "25"),
+        Question("simulated", "Use its simulation", default=False),
+    )
+
+
+def guided(answers: Mapping[str, str | bool], guide: Guide) -> None:
+    """Measure from a page where a camera is mounted, and write it if the operator agrees.
+
+    Raises:
+        IbrobotError: if an answer makes no sense, or the episode cannot tell the mount.
+    """
+    given = {name: str(answer).strip() for name, answer in answers.items()}
     try:
-        text = source.read_bytes().decode()
-        replace_file(source, with_transform(text, camera, values))
-    except IbrobotError as error:
-        raise SensorError(f"{source}: {error}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise SensorError(f"{source}: cannot be written: {error}") from None
+        columns, rows = (int(each) for each in given["squares"].lower().split("x"))
+        command = MountCamera(
+            columns=columns, rows=rows, square=float(given["square"]), robot=given["robot"],
+            episodes=(Path(given["episode"]).expanduser(),), camera=given["camera"], on=given["on"],
+            board_on=given["board_on"], sim=answers["simulated"] is True,
+        )  # fmt: skip
+    except ValueError as error:
+        raise RequestError(f"the board: {error}; give its squares as 10 x 7, and their side in mm") from None
+    found = command.found()
+    for line in found.mounting.lines():
+        guide.say(line)
+    guide.say(found.line)
+    if found.source.resolve() in {path.resolve() for path in installed_plugins().shipped_configs().values()}:
+        guide.say("This robot is shipped with ibrobot: put the line into a robot YAML of your own.")
+    elif guide.confirm(f"Write it into {found.source}?", flag="--write"):
+        found.save()
+        guide.say(f"{found.source}: the mount of {found.camera} is written")
