@@ -13,7 +13,6 @@ from ibrobot_damiao.emulator import EmulatedMotor, EmulatedMotors
 from ibrobot_damiao.emulator.serve import SlcanServer
 from ibrobot_testing import ibrobot_command
 
-pytestmark = pytest.mark.integration
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "drive-a-can-arm.md"
 JOINTS = 8
 

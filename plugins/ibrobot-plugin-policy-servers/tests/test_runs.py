@@ -15,7 +15,6 @@ from ibrobot_core.app import ComponentFailed
 if TYPE_CHECKING:
     from fake_runs import Runs
 
-pytestmark = pytest.mark.integration
 
 MODEL = (
     "models.net={{type: openpi, url: '{url}', observations: [{{observation: observation.state, key: [state], "

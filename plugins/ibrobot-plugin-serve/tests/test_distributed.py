@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from ibrobot_core.app import Runtime
 
-pytestmark = pytest.mark.integration
 
 MODE = "control_modes.policy.inference.execution_mode={}"
 NETWORK = "transport={type: shared}"

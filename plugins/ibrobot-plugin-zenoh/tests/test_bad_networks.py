@@ -42,7 +42,6 @@ def serving() -> object:
         process.communicate()
 
 
-@pytest.mark.integration
 def test_a_killed_server_is_missed_and_used_again(serving: Callable[[str], subprocess.Popen[str]]):
     endpoint = free_endpoint()
     robot = client(endpoint)
@@ -122,7 +121,6 @@ raise SystemExit(3)
 """
 
 
-@pytest.mark.integration
 @pytest.mark.parametrize("how", ["close", "forget"])
 def test_a_process_ends_also_when_nothing_was_closed(how: str):
     command = [sys.executable, "-c", PROGRAM, free_endpoint(), how]

@@ -165,7 +165,6 @@ def test_pub_of_another_type_is_refused(robot: ZenohTransport, endpoint: str):
         run("pub", "/joint_states", "std_msgs/msg/Bool", "data: true", "--endpoint", endpoint)
 
 
-@pytest.mark.integration
 @pytest.mark.parametrize("command", [["echo", "/joint_states"], ["hz", "/joint_states", "--period", "0.05"]])
 def test_ctrl_c_ends_it_cleanly(command: list[str], robot: ZenohTransport, endpoint: str):
     with subprocess.Popen(

@@ -100,7 +100,6 @@ def test_names_are_those_of_rmw_zenoh():
     assert caller_of(b"too short") == (0, bytes(16))
 
 
-@pytest.mark.integration
 @pytest.mark.skipif(not importlib.util.find_spec("zenoh_ros2_sdk"), reason="needs zenoh-ros2-sdk")
 def test_services_of_a_ros_2_node_of_another_make():
     endpoint = free_endpoint()

@@ -174,7 +174,6 @@ def test_ill_formed_tokens_are_passed_over():
     assert topics_of_tokens([good, good, listener, *bad]) == [SharedTopic("/a", "std_msgs/msg/Bool", 1, 1)]
 
 
-@pytest.mark.integration
 @pytest.mark.skipif(not importlib.util.find_spec("zenoh_ros2_sdk"), reason="needs zenoh-ros2-sdk")
 def test_a_ros_2_node_of_another_make_hears_and_is_heard():
     endpoint = free_endpoint()
