@@ -16,6 +16,11 @@ from entrance_table import read_table
 
 ROOT = Path(__file__).parents[2]
 NAMED = {name for row in read_table() for name in row.names}
+ROW = (
+    "name what moves the robot in the table `Every entrance to motion` of docs/explanation/safety.md: in the row "
+    "whose cells are true of it, or in a row of its own; tests/integration/test_entrances.py then measures the cells"
+)
+"""What to do about an entrance that the table does not have."""
 """The entrances in the table."""
 KINDS = {"TeleopDescriptor": "teleop", "EngineDescriptor": "engine", "SourceDescriptor": "source"}
 """Kinds of plugins whose types are entrances of their own."""
@@ -192,7 +197,7 @@ def unknown(found: set[str], *known: set[str] | dict[str, str]) -> list[str]:
 
 def test_types_of_plugins_have_rows() -> None:
     found = {f"{KINDS[descriptor]} {first(call, 'type')}" for descriptor in KINDS for _, call in calls(descriptor)}
-    assert unknown(found, NAMED) == [], "add a row to the table of entrances in docs/explanation/safety.md"
+    assert unknown(found, NAMED) == [], ROW
     rows = {name for name in NAMED if name.split()[0] in KINDS.values()}
     assert unknown(rows, found) == [], "there is no such type"
 
@@ -204,9 +209,9 @@ def test_services_have_rows_or_move_nothing() -> None:
             found.add(name)
         else:
             computed.add(f"{file}: {ast.unparse(call.args[0])}")
-    assert unknown(found, NAMED, STILL_SERVICES) == []
+    assert unknown(found, NAMED, STILL_SERVICES) == [], f"{ROW}; a service that moves nothing goes into STILL_SERVICES"
     assert unknown(STILL_SERVICES, found) == [], "there is no such service"
-    assert unknown(computed, OTHER_SERVICES) == []
+    assert unknown(computed, OTHER_SERVICES) == [], "say in OTHER_SERVICES which names this makes"
     assert unknown({name for name in NAMED if name[0] == "/"}, found, {"/cmd_pose", "/cmd_goal"}) == [], (
         "there is no such service"
     )
@@ -214,7 +219,7 @@ def test_services_have_rows_or_move_nothing() -> None:
 
 def test_topics_that_are_read_have_rows_or_move_nothing() -> None:
     found = {file for file, call in calls("subscribe") if "bus" in ast.unparse(call.func)}
-    assert unknown(found, SUBSCRIBERS) == []
+    assert unknown(found, SUBSCRIBERS) == [], f"{ROW}, and name it in SUBSCRIBERS; what moves nothing has '' there"
     assert unknown(set(SUBSCRIBERS), found) == [], "it reads no topic"
     assert set(filter(None, SUBSCRIBERS.values())) <= NAMED
 
@@ -227,7 +232,7 @@ def test_what_sends_plans_and_goals_to_control_has_a_row() -> None:
             bases = {base.id for base in node.bases if isinstance(base, ast.Name)}
             found |= {file} if bases & {"SourceWorker", "CommandSource"} else set()
     found.discard("ibrobot_core/component.py")  # the base class
-    assert unknown(found, SENDERS) == []
+    assert unknown(found, SENDERS) == [], f"{ROW}, and name it in SENDERS"
     assert unknown(set(SENDERS), found) == [], "it sends nothing"
     assert set(filter(None, SENDERS.values())) <= NAMED
 
@@ -236,7 +241,7 @@ def test_actions_of_ros_have_rows() -> None:
     texts = (node.value for _, node in NODES if isinstance(node, ast.Constant))
     prefix = "control_msgs/action/"
     found = {text.removeprefix(prefix) for text in texts if isinstance(text, str) and text.startswith(prefix)} - {""}
-    assert unknown(found, NAMED) == []
+    assert unknown(found, NAMED) == [], ROW
     assert {"FollowJointTrajectory", "GripperCommand", "ParallelGripperCommand"} <= NAMED
 
 
@@ -244,7 +249,7 @@ def test_commands_of_pages_have_rows_or_move_nothing() -> None:
     trees = [assigned("ibrobot_web/messages.py", "_COMMANDS"), assigned("ibrobot_web/messages.py", "SERVICES")]
     nodes = (node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Constant))
     found = {node.value for node in nodes if isinstance(node.value, str)}
-    assert unknown(found, PAGE_COMMANDS) == []
+    assert unknown(found, PAGE_COMMANDS) == [], f"{ROW}, and name it in PAGE_COMMANDS; what moves nothing has '' there"
     assert unknown(set(PAGE_COMMANDS), found) == [], "pages have no such command"
     rows = {name for name in NAMED if name.startswith("page ")}
     assert rows == {name for name in PAGE_COMMANDS.values() if name}

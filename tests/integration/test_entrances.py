@@ -343,6 +343,7 @@ def test_cell(name: str, column: str, cell: str, tmp_path: Path, monkeypatch: py
     if (elsewhere := ELSEWHERE.get((name, column))) is not None:
         check_elsewhere(elsewhere)
         return None
+    assert name in ADAPTERS, f"say in ADAPTERS how `{name}` is used, e.g. as the other names of its row are"
     make = ADAPTERS[name]
     match cell:
         case "not checked":

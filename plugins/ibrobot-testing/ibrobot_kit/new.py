@@ -80,19 +80,22 @@ class NewPlugin:
             shutil.move(Path(drafted, "package"), folder)
         for file, text in lists.items():
             file.write_text(text, encoding="utf-8")
-        listed = [str(file.relative_to(repository.root)) for file in lists] if repository is not None else []
+        root = repository.root if repository is not None else Path()
+        listed = [str(file.relative_to(root)) for file in lists]
         robot = next(text for path, text in files.items() if path.endswith(f"{self.name}.yaml"))
         command = robot.partition("\n")[0].partition(": ")[2]  # at the top of the file
-        return {"folder": str(folder), "files": sorted(files), "entered": listed, "command": command}
+        made = {"folder": str(folder), "files": sorted(files), "entered": listed, "command": command}
+        return made | ({"root": str(root)} if listed else {})
 
     def show(self, made: dict[str, Any]) -> None:
         """Print what comes next."""
         echo(f"{made['folder']}: {len(made['files'])} files")
         if made["entered"]:
             echo(f"entered in {', '.join(made['entered'])}")
-            echo("next: uv sync --group cluster && uv run python tests/house/official_plugins.py")
-            lists = "tests/test_distributions.py tests/docs/test_entrances_listed.py"
-            echo(f"then: uv run pytest {made['folder']}/tests {lists}")
+            here = shlex.quote(made["root"])
+            echo(f"next: cd {here} && uv sync --group cluster && uv run python tests/house/official_plugins.py")
+            lists = "tests/test_distributions.py tests/house/test_names.py tests/docs/test_entrances_listed.py"
+            echo(f"then: uv run pytest plugins/{Path(made['folder']).name}/tests {lists}")
             return
         here = Path(sys.executable)
         python = "python" if Path(shutil.which("python") or "").parent == here.parent else shlex.quote(str(here))

@@ -216,6 +216,19 @@ def test_in_the_repository_it_enters_what_a_package_there_needs(checkout: Path) 
     assert not (package / ".github").exists()
 
 
+def test_in_the_repository_it_prints_commands_for_its_folder(
+    checkout: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(checkout / "plugins")
+    new = NewPlugin("teleop", "my_stick")
+    new.show(new())
+    (first, then) = capsys.readouterr().out.splitlines()[-2:]
+    assert first.startswith(f"next: cd {checkout} && uv sync ")
+    assert then.startswith("then: uv run pytest plugins/ibrobot-plugin-my-stick/tests tests/")
+    tests = [word for word in then.split() if word.startswith("tests/")]
+    assert all((ROOT / each).is_file() for each in tests)
+
+
 def test_repository_with_a_list_missing_is_left_as_it_is(checkout: Path) -> None:
     (checkout / "README.zh.md").write_text("# empty\n")
     before = (checkout / "pyproject.toml").read_text()
