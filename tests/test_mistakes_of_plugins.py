@@ -81,6 +81,116 @@ def test_mistake_is_named_with_its_package(site: Site, tmp_path: Path, mistake: 
         registry.find("teleop", "wave")
 
 
+YIELD = 'TeleopDescriptor("wave", Wave, "waves", options=Given)'
+SIBLINGS = {
+    '"wave"': (
+        *map(
+            repr,
+            (
+                " ",
+                "wave ",
+                " wave",
+                "wave\n",
+                "\twave",
+                "wave\x00",
+                "wave\x1b[2J",
+                "wave/..",
+                "../wave",
+                "-wave",
+                ".wave",
+                "_wave",
+                "wave:1",
+                "wave,2",
+                "{wave}",
+                "wave\u202eevaw",
+                "\u200bwave",
+                "wave*",
+                "$wave",
+            ),
+        ),
+        "None",
+        "3",
+        "True",
+        "b'wave'",
+        "['wave']",
+        "('wave',)",
+        "{}",
+        "Wave",
+    ),
+    "Wave,": ("3,", "'fake_wave:Wave',", "[],", "{},", "Wave(),", "Options(),", "...,"),
+    "options=Given": (
+        "options=None",
+        "options=3",
+        "options='Given'",
+        "options=dict",
+        "options=int",
+        "options=Wave",
+        "options=[Given]",
+        "options={'gain': 1.0}",
+        "options=lambda: Given()",
+        "options=Teleop",
+        "options=attrs.make_class('G', ['gain'])",
+    ),
+    OPTIONS: (
+        "option('one', ge=0)",
+        "option(float('nan'), ge=0)",
+        "option(-1e-9, ge=0)",
+        "option(2.0, ge=0, le=1)",
+        "option('b', choices=('a',))",
+        "option('', choices=('a', 'b'))",
+    ),
+    f"yield {YIELD}": (
+        "return 3",
+        "return 'wave'",
+        "return True",
+        f"return {YIELD}",
+        "yield None",
+        "yield 3",
+        "yield 'wave'",
+        "yield Wave",
+        "yield TeleopDescriptor",
+        f"yield [{YIELD}]",
+        f"yield (lambda: {YIELD})",
+        "yield TeleopDescriptor('wave')",
+        "yield TeleopDescriptor('wave', Wave, 'waves', optoins=Given)",
+        "1 / 0; yield",
+        "raise KeyError('wave')",
+        "import no_such_library",
+        "yield wave",
+        "assert False",
+    ),
+    "@hookimpl\ndef ibrobot_teleop()": (
+        "@hookimpl\ndef ibrobot_telop()",
+        "@hookimpl\ndef ibrobot_teleop(robot)",
+        "def ibrobot_teleop()",
+        "@hookimpl\ndef teleop()",
+        "@hookimpl()\ndef ibrobot_hardwares()",
+        "@hookimpl\nasync def ibrobot_teleop()",
+        "@hookimpl\nclass ibrobot_teleop",
+    ),
+}
+"""What stands in a right plugin -> mistakes of an author in its place."""
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong"), [(right, wrong) for right, mistakes in SIBLINGS.items() for wrong in mistakes], ids=ascii
+)
+def test_sibling_of_a_mistake_is_one_line_that_names_the_package(
+    site: Site, tmp_path: Path, right: str, wrong: str
+) -> None:
+    source = HEAD + YIELDS
+    assert right in source
+    offer(site, tmp_path, source.replace(right, wrong))
+    registry = discover(site.entry_points())
+    lines = [str(failure) for failure in registry.failures]
+    assert lines, "the mistake is accepted"
+    for line in lines:
+        assert line.startswith("plugin 'fake_wave' (fake-wave) ")
+        assert line.isprintable(), ascii(line)
+    with pytest.raises(PluginError, match="fake-wave"):
+        registry.find("teleop", "wave")
+
+
 MESSAGE = """
 import attrs
 from ibrobot_core.api import Header, Late, Message, MessageDescriptor, hookimpl
