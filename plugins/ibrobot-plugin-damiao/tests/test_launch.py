@@ -6,12 +6,14 @@ import json
 import os
 import re
 import subprocess
+import threading
 from pathlib import Path
 
 import pytest
 from ibrobot_damiao.emulator import EmulatedMotor, EmulatedMotors
 from ibrobot_damiao.emulator.serve import SlcanServer
 from ibrobot_testing import ibrobot_command
+from ibrobot_testing.suite import wait_until
 
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "drive-a-can-arm.md"
 JOINTS = 8
@@ -62,3 +64,39 @@ def test_a_hot_motor_stops_the_arm_and_is_named(robot: Path) -> None:
     faults = json.loads(ended.stdout)["faults"]
     assert "motor 4 (joint4): temperature 100 deg C, above max_temperature (90 deg C)" in str(faults)
     assert all(abs(motor.angle) < 0.1 for motor in motors.motors)
+
+
+def test_a_cable_that_is_pulled_in_a_run_is_a_fault_that_says_what_to_check(robot: Path) -> None:
+    motors = EmulatedMotors(EmulatedMotor(motor) for motor in range(1, JOINTS + 1))
+    with SlcanServer(motors) as adapter:
+
+        def pull() -> None:
+            wait_until(lambda: any(abs(motor.angle) > 0.05 for motor in motors.motors), 60.0)
+            adapter.unplug()
+
+        pulling = threading.Thread(target=pull)
+        pulling.start()
+        ended = launched(robot, adapter, "--duration", "8", "--json")
+        pulling.join()
+    assert re.search(
+        r"socket://127.0.0.1:\d+: (has failed|does not take a frame): .*; check the adapter's cable, and that no other",
+        f"{ended.stdout} {ended.stderr}",
+    ), ended.stderr
+    assert ended.returncode != 0
+
+
+@pytest.mark.parametrize(
+    ("ids", "reason"),
+    [
+        ([1, 2, 3, 4, 5, 6, 7, 9], r"motor 8 \(gripper\): does not answer; check its power, its cable, and .* its id"),
+        ([1, 2, 3, 4, 5, 6, 7, 7], r"motor 7 \(joint7\): 2 motors have this id; connect one at a time"),
+        ([1, 2, 3, 4, 5, 16, 17, 8], r"no answer from motors 6 \(joint6\), 7 \(joint7\); check their power"),
+    ],
+)
+def test_wrong_ids_are_named_before_a_motor_has_torque(robot: Path, ids: list[int], reason: str) -> None:
+    motors = EmulatedMotors(EmulatedMotor(motor) for motor in ids)
+    with SlcanServer(motors) as adapter:
+        ended = launched(robot, adapter, "--duration", "2")
+    assert re.search(reason, ended.stderr), ended.stderr
+    assert ended.returncode != 0
+    assert not any(motor.state for motor in motors.motors)
