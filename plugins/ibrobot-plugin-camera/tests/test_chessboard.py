@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from typing import Any, override
 
 import cv2
 import numpy as np
@@ -11,13 +14,18 @@ import pytest
 from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ibrobot_camera.commands import calibrate
 from ibrobot_camera.intrinsics import chessboard
 from ibrobot_camera.intrinsics.board import Board
 from ibrobot_camera.intrinsics.chessboard import find_corners, windows_of
 from ibrobot_camera.intrinsics.solve import solve
 from ibrobot_camera.intrinsics.views import Views, find
+from ibrobot_terminal.fakes import FakeGuide
 from ibrobot_testing.command import command_line
 from numpy.typing import NDArray
+
+from ibrobot_core.api import SensorError
+from ibrobot_core.app import RequestError
 
 from .lens_rays import directions
 
@@ -159,3 +167,43 @@ def test_the_command_reads_a_folder(tmp_path: Path) -> None:
     assert failed.exit_code != 0
     assert "a plain chessboard needs --chessboard" in str(failed.exception)
     assert not (tmp_path / "none.yaml").exists()
+
+
+class Watching(FakeGuide):
+    """Looks at the table until all pictures were shown."""
+
+    @override
+    def wait(self, request: str, *, rows: Any = None, **more: object) -> None:
+        self.said.append(request)
+        for _ in range(3 * len(POSES)):
+            self.tables.append(rows())
+
+
+@pytest.mark.parametrize("marked", [False, True])
+def test_the_page_takes_a_plain_chessboard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, marked: bool) -> None:
+    shown = iter([pose for pose in POSES for _ in range(3)])  # still for a moment each
+
+    @contextmanager
+    def camera_of(source: str) -> Iterator[tuple[str, Any]]:
+        yield "side", lambda timeout_s: taken(next(shown), 0.7, 1.0)
+
+    monkeypatch.setattr(calibrate, "camera", camera_of)
+    answers: dict[str, str | bool] = {
+        "camera": "side", "file": str(tmp_path / "side.yaml"), "squares": "10x7", "square": "25",
+        "chessboard": not marked,
+    }  # fmt: skip
+    assert {each.name for each in calibrate.questions()} == set(answers)
+    guide = Watching()
+    if marked:
+        with pytest.raises(SensorError, match="0 views; at least 10 are needed"):
+            calibrate.guided(answers, guide)
+        return
+    calibrate.guided(answers, guide)
+    assert guide.tables[-1][0][0] == "12"
+    assert guide.said[-1].endswith(f"info: {tmp_path}/side.yaml")
+
+
+@pytest.mark.parametrize("changes", [{"squares": "10"}, {"squares": "3 x 7"}, {"square": "wide"}, {"square": "-1"}])
+def test_a_board_that_makes_no_sense_is_named(changes: dict[str, str]) -> None:
+    with pytest.raises(RequestError, match="give its squares as 10 x 7, and their side in mm"):
+        calibrate.board_of({"squares": "10 x 7", "square": "25", **changes})

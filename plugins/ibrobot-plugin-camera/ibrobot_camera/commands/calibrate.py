@@ -17,7 +17,7 @@ from ibrobot_camera.intrinsics.board import PAPERS, Board
 from ibrobot_camera.intrinsics.solve import FEWEST_VIEWS, Intrinsics, solve
 from ibrobot_camera.intrinsics.views import View, Views, find
 from ibrobot_core.api import SensorError, option
-from ibrobot_core.app import echo, wrong_input
+from ibrobot_core.app import RequestError, echo, wrong_input
 
 VIEWS = 20
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
@@ -150,20 +150,32 @@ def questions() -> tuple[Question, ...]:
     return (
         Question("camera", "Camera", names[0] if names else "", names, open=True),
         Question("file", "File to write", "camera.yaml"),
+        Question("squares", "Squares of the board, columns x rows", "10 x 7"),
         Question("square", "Side of a square of the printed board [mm]", "25"),
+        Question("chessboard", "The board is a plain chessboard, without markers", default=False),
     )
+
+
+def board_of(answers: Mapping[str, str | bool]) -> Board:
+    """The board that an operator has, by the answers `squares` and `square`.
+
+    Raises:
+        RequestError: if they make no sense.
+    """
+    try:
+        columns, rows = (int(each) for each in str(answers["squares"]).lower().split("x"))
+        return Board(columns=columns, rows=rows, square=float(answers["square"]))
+    except ValueError as error:
+        raise RequestError(f"the board: {error}; give its squares as 10 x 7, and their side in mm") from None
 
 
 def guided(answers: Mapping[str, str | bool], guide: Guide) -> None:
     """Calibrate a camera from a page.
 
     Raises:
-        SensorError: if the camera does not open, or its views cannot tell the lens.
+        IbrobotError: if an answer makes no sense, the camera does not open, or its views cannot tell the lens.
     """
-    try:
-        board = Board(square=float(answers["square"]))
-    except ValueError as error:
-        raise SensorError(f"side of a square: {error}") from None
+    board, markers = board_of(answers), answers["chessboard"] is not True
     views, picture = Views(), np.zeros((1, 1), np.uint8)
     with camera(str(answers["camera"])) as (name, read):
 
@@ -171,7 +183,7 @@ def guided(answers: Mapping[str, str | bool], guide: Guide) -> None:
             nonlocal picture
             if (taken := read(0.02)) is not None:
                 picture = taken
-                views.add_live(find(taken, board, f"view {len(views.views) + 1}"))
+                views.add_live(find(taken, board, f"view {len(views.views) + 1}", markers=markers))
             return [[str(len(views.views)), views.missing(VIEWS) or "enough: go on"]]
 
         guide.wait(

@@ -16,6 +16,7 @@ from ibrobot_provenance.files import replace_file
 from ibrobot_terminal import Guide, Question
 
 from ibrobot_camera.calibration import load_info
+from ibrobot_camera.commands.calibrate import board_of
 from ibrobot_camera.intrinsics.board import Board
 from ibrobot_camera.mounting.edit import with_transform
 from ibrobot_camera.mounting.episode import Source
@@ -204,16 +205,12 @@ def guided(answers: Mapping[str, str | bool], guide: Guide) -> None:
         IbrobotError: if an answer makes no sense, or the episode cannot tell the mount.
     """
     given = {name: str(answer).strip() for name, answer in answers.items()}
-    try:
-        columns, rows = (int(each) for each in given["squares"].lower().split("x"))
-        command = MountCamera(
-            columns=columns, rows=rows, square=float(given["square"]), robot=given["robot"],
-            episodes=(Path(given["episode"]).expanduser(),), camera=given["camera"], on=given["on"],
-            board_on=given["board_on"], sim=answers["simulated"] is True,
-        )  # fmt: skip
-    except ValueError as error:
-        raise RequestError(f"the board: {error}; give its squares as 10 x 7, and their side in mm") from None
-    found = command.found()
+    board = board_of(answers)
+    found = MountCamera(
+        columns=board.columns, rows=board.rows, square=board.square, robot=given["robot"],
+        episodes=(Path(given["episode"]).expanduser(),), camera=given["camera"], on=given["on"],
+        board_on=given["board_on"], sim=answers["simulated"] is True,
+    ).found()  # fmt: skip
     for line in found.mounting.lines():
         guide.say(line)
     guide.say(found.line)

@@ -532,6 +532,7 @@ export default {
   "Link that carries the camera": "承载相机的连杆",
   "Link that carries the board; empty for the base": "承载标定板的连杆；留空为基座",
   "Squares of the board, columns x rows": "标定板的方格数，列 x 行",
+  "The board is a plain chessboard, without markers": "标定板是没有标记的普通棋盘格",
   "Put a camera back": "把相机放回原位",
   "Show what a camera sees over what it saw in a reference of `ibrobot preflight`, until it fits again.": "把相机现在看到的画面与 `ibrobot preflight` 参考中的画面叠加显示，直到重新吻合。",
   "Turn the camera until what it sees lies on the red lines: they are where things were in the reference.": "转动相机，直到画面与红线重合：红线是参考中物体所在的位置。",
