@@ -315,8 +315,13 @@ class Window:
 
 
 def grips(joint: str) -> bool:
-    """Whether a joint is one of a gripper or a hand, by its name."""
-    return any(part in joint.lower() for part in ("grip", "jaw", "hand", "finger", "thumb"))
+    """Whether a joint is that of a gripper, by its name."""
+    return any(part in joint.lower() for part in ("grip", "jaw"))
+
+
+def holds(joint: str) -> bool:
+    """Whether a joint is that of a gripper or a hand, by its name: it stops at what it holds, and where it is shut."""
+    return grips(joint) or any(part in joint.lower() for part in ("hand", "finger", "thumb"))
 
 
 def _object(metadata: Mapping[str, str], key: str, name: str) -> Mapping[str, Any]:

@@ -630,3 +630,20 @@ def test_what_parts_the_arm_from_the_answers_has_the_largest_share(options, part
     shares = explanation.facts()["between"]["mean_difference_rad"]
     assert max(shares, key=lambda each: shares[each]) == part
     assert (explanation.facts()["between"]["share_at_limit"]["velocity"] > 0.5) == (part == "limits")
+
+
+def test_two_of_many_joints_that_are_exchanged_are_named():
+    """Of a robot with two arms and hands."""
+    rng, at = np.random.default_rng(0), np.arange(90)[:, None] / 30
+    middles, widths = rng.uniform(-1, 1, (2, 26))
+    names = [f"joint_{number}" for number in range(26)]
+
+    def moved() -> NDArray[np.float64]:
+        return middles + widths * np.sin(2 * at + rng.normal(0, 0.05, 26)) + rng.normal(0, 0.01, 26)
+
+    card = Reference(make_card(make_window(moved(), joints=names, name=f"demo {number}") for number in range(8)))
+    assert "joint_order" not in {each.name for each in diagnose(make_window(moved(), joints=names), card).findings}
+    exchanged = make_window(moved()[:, [0, 5, 2, 3, 4, 1, *range(6, 26)]], joints=names)
+    (first, *_) = diagnose(exchanged, card).findings
+    assert first.name == "joint_order"
+    assert "joint_1 behaves as joint_5, joint_5 behaves as joint_1" in first.evidence.text

@@ -102,3 +102,11 @@ def test_joint_that_slows_down_before_it_stands_at_its_end_is_not_cut_off(eases,
     commands = np.column_stack([turned, 0.02 * np.arange(120)])
     named = {each.name for each in diagnose(make_window(commands), Reference()).findings}
     assert ("saturated" in named) == accused
+
+
+@pytest.mark.parametrize(("name", "accused"), [("elbow", True), ("gripper", False), ("kLeftHandPinky", False)])
+def test_joint_that_holds_something_stands_at_its_end(name, accused):
+    at = np.clip(np.arange(120) / 40, 0.0, 1.0)
+    commands = np.column_stack([0.02 * np.arange(120), 0.8 * at])
+    window = make_window(commands, joints=("pan", name))
+    assert ("saturated" in {each.name for each in diagnose(window, Reference()).findings}) == accused

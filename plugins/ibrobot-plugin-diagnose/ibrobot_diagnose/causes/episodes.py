@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ibrobot_diagnose.card import Card, jerk_of, rests_of, series_of, way_of
 from ibrobot_diagnose.cause import CardCause, Cause, Evidence, Reference, likelihood
-from ibrobot_diagnose.window import Floats, Window, grips
+from ibrobot_diagnose.window import Floats, Window, grips, holds
 
 _SHOWN = frozenset({"demonstration", "state"})
 _SLOW = 0.003
@@ -109,7 +109,7 @@ class Saturated(Cause):
                 cut = _cut_off(still, steps[:, joint], np.delete(steps, joint, axis=1))
                 shares[joint] = max(shares[joint], (cut[1:] & moving).sum() / max(1, int(moving.sum())))
         # A gripper that is shut stands at its end, too.
-        shares = np.array([0.0 if grips(joint) else share for joint, share in zip(window.joints, shares, strict=True)])
+        shares = np.array([0.0 if holds(joint) else share for joint, share in zip(window.joints, shares, strict=True)])
         j = int(np.argmax(shares))
         text = (
             f"{window.joints[j]} stands at the end of its range for {100 * shares[j]:.0f} % of the motion: it is cut "

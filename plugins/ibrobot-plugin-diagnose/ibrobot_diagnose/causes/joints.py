@@ -17,6 +17,7 @@ from ibrobot_diagnose.window import Floats, Window, grips
 
 _MIDDLE = slice(1, -1)
 """Levels of the quantiles that are compared."""
+_MOST_JOINTS = 64
 _REPEATS = 0.6
 """Usual distance up to which pictures of a camera repeat, so that they say something of the pose."""
 _CONSEQUENCES = frozenset({
@@ -196,7 +197,7 @@ class JointOrder(CardCause):
     @override
     def compare(self, window: Window, card: Card) -> Evidence | None:
         size = len(window.joints)
-        if not _same(window, card) or size > 16:
+        if not _same(window, card) or size > _MOST_JOINTS:
             return None
         costs = _costs(_known(window), card)
         starts = _known(window)[:1].T - np.median(card.starts, axis=0)[None]

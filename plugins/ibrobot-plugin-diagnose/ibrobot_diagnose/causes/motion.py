@@ -8,7 +8,7 @@ import numpy as np
 
 from ibrobot_diagnose.cause import Cause, Evidence, Reference, likelihood
 from ibrobot_diagnose.course import CONFLICT, begins_to_move, chance_of_noise, conflict_of, course_of, delay_of
-from ibrobot_diagnose.window import Floats, Window, grips
+from ibrobot_diagnose.window import Floats, Window, holds
 
 
 class ArmNotFollowing(Cause):
@@ -27,7 +27,7 @@ class ArmNotFollowing(Cause):
     def test(self, window: Window, reference: Reference) -> Evidence | None:
         delays, rests = delay_of(window)
         ranges, asked = _ranges(window.states), _ranges(window.commands)
-        for gripper in (i for i, joint in enumerate(window.joints) if grips(joint)):
+        for gripper in (i for i, joint in enumerate(window.joints) if holds(joint)):
             if ranges[gripper] > 0.1 * asked[gripper]:  # it holds something
                 rests[gripper] = np.nan
         if not np.isfinite(rests).any():
