@@ -96,7 +96,8 @@ class Fault:
 
 
 def _zero(positions: Floats) -> Floats:
-    return positions + np.radians(20.0) * (np.arange(positions.shape[1]) == 0)
+    shift: Floats = np.radians(20.0) * (np.arange(positions.shape[1]) == 0)
+    return positions + shift
 
 
 def _order(positions: Floats) -> Floats:
@@ -170,10 +171,10 @@ def seen(episode: Path, fault: Fault) -> Window:
 def with_fault(episode: Path, plain: Window, fault: Fault) -> Window:
     """A recording with a fault; it is read again only if its pictures become others."""
     recording = plain if fault.looks is _unchanged and not fault.exchanged else seen(episode, fault)
-    tracks = {"state": recording.state, "command": recording.command}
-    return attrs.evolve(
-        recording, **{name: attrs.evolve(each, values=fault.reads(each.values)) for name, each in tracks.items()}
+    state, command = (
+        attrs.evolve(each, values=fault.reads(each.values)) for each in (recording.state, recording.command)
     )
+    return attrs.evolve(recording, state=state, command=command)
 
 
 def main() -> int:

@@ -639,7 +639,8 @@ def test_two_of_many_joints_that_are_exchanged_are_named():
     names = [f"joint_{number}" for number in range(26)]
 
     def moved() -> NDArray[np.float64]:
-        return middles + widths * np.sin(2 * at + rng.normal(0, 0.05, 26)) + rng.normal(0, 0.01, 26)
+        swung: NDArray[np.float64] = widths * np.sin(2 * at + rng.normal(0, 0.05, 26))
+        return middles + rng.normal(0, 0.01, 26) + swung
 
     card = Reference(make_card(make_window(moved(), joints=names, name=f"demo {number}") for number in range(8)))
     assert "joint_order" not in {each.name for each in diagnose(make_window(moved(), joints=names), card).findings}
