@@ -456,6 +456,11 @@ class Maker:
                     name = f"pictures of {camera.name}"
                     self._ages.setdefault(name, []).append(float(np.median(ages)) / 1e6)
 
+    @property
+    def ways(self) -> Sequence[Floats]:
+        """The ways of its episodes, see `way_of`, shape (1, WAY * J) each."""
+        return self._tables["ways"]
+
     def _widen(self, limits: tuple[Limits, ...]) -> None:
         """Keep the widest limits of each joint."""
         if all(each == Limits() for each in limits):

@@ -107,7 +107,8 @@ def other_norm_mode(data: Reference) -> tuple[Window, Reference]:
 
 @cache
 def plain_run() -> Window:
-    return window_of(Run(seed=9500, outcome="failure", **NONE))
+    window: Window = window_of(Run(seed=9500, outcome="failure", **NONE))
+    return window
 
 
 OF_THE_DATA: dict[str, Callable[[Reference], tuple[Window, Reference]]] = {
@@ -639,8 +640,8 @@ def test_two_of_many_joints_that_are_exchanged_are_named():
     names = [f"joint_{number}" for number in range(26)]
 
     def moved() -> NDArray[np.float64]:
-        swung: NDArray[np.float64] = widths * np.sin(2 * at + rng.normal(0, 0.05, 26))
-        return middles + rng.normal(0, 0.01, 26) + swung
+        states: NDArray[np.float64] = middles + widths * np.sin(2 * at + rng.normal(0, 0.05, 26))
+        return states
 
     card = Reference(make_card(make_window(moved(), joints=names, name=f"demo {number}") for number in range(8)))
     assert "joint_order" not in {each.name for each in diagnose(make_window(moved(), joints=names), card).findings}

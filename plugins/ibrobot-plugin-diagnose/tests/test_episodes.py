@@ -6,6 +6,7 @@ import itertools
 from collections import Counter
 from pathlib import Path
 
+import attrs
 import numpy as np
 import pytest
 from ibrobot_diagnose.card import Maker, make_card
@@ -110,3 +111,23 @@ def test_joint_that_holds_something_stands_at_its_end(name, accused):
     commands = np.column_stack([0.02 * np.arange(120), 0.8 * at])
     window = make_window(commands, joints=("pan", name))
     assert ("saturated" in {each.name for each in diagnose(window, Reference()).findings}) == accused
+
+
+def test_copy_is_named_wherever_it_stands_in_the_dataset(others):
+    """Also in the part of the dataset with which an episode is not compared otherwise."""
+    makers = []
+    for seed in (1, 2, 3, 4, 5, 1, 2):
+        makers.append(Maker())
+        makers[-1].add(demo(seed=seed))
+    makers.insert(3, Maker())  # one that cannot be used
+    ways = check.nearest_ways(makers)
+    named = [
+        "duplicate" in {each.name for each in diagnose(demo(seed=seed), with_ways(others, way)).findings}
+        for seed, way in zip((1, 2, 3, 4, 5, 1, 2), ways[:3] + ways[4:], strict=True)
+    ]
+    assert named == [True, True, False, False, False, True, True]
+    assert len(ways[3]) == 0
+
+
+def with_ways(reference, ways):
+    return Reference(attrs.evolve(reference.card, ways=ways))

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+import numpy as np
 from ibrobot_provenance.jobs import Job, open_pool
 
 from ibrobot_core.api import DatasetError, RecorderError
@@ -20,7 +21,7 @@ from ibrobot_diagnose.options import CheckOptions, CheckProgress, CheckReport
 from ibrobot_diagnose.pictures import Shown
 from ibrobot_diagnose.references import find_episodes, read_episode
 from ibrobot_diagnose.report import finding_facts
-from ibrobot_diagnose.window import Window
+from ibrobot_diagnose.window import Floats, Window
 
 _PARTS = 5
 """The episodes of a part are compared with the ones of the other parts."""
@@ -90,7 +91,11 @@ def _checked(
     readable = [episode for episode in episodes if episode in makers]
     parts = min(_PARTS, len(readable))
     cards = [_card([makers[each] for i, each in enumerate(readable) if i % parts != part]) for part in range(parts)]
-    jobs = [Job(check_episode, (each, cards[i % parts])) for i, each in enumerate(readable)]
+    ways = nearest_ways([makers[each] for each in readable])
+    jobs = [
+        Job(check_episode, (each, attrs.evolve(cards[i % parts], ways=way)))
+        for i, (each, way) in enumerate(zip(readable, ways, strict=True))
+    ]
     results = {episode: result for episode, result in run(jobs)}
     listed = []
     for episode in (each for each in readable if each in results):
@@ -108,6 +113,25 @@ def _checked(
         "untested": [{"name": name, "why": why, "episodes": count} for (name, why), count in broken.items()],
     }  # fmt: skip
     return checked, {each["episode"]: results[Path(each["episode"])].shown for each in listed}
+
+
+def nearest_ways(makers: Sequence[Maker]) -> list[Floats]:
+    """The way of another episode that is nearest to that of each, whatever their parts, shape (1, WAY * J) each.
+
+    None at all, shape (0, WAY * J), of an episode that has no way.
+    """
+    rows = [each.ways[0] if each.ways else None for each in makers]
+    known = np.concatenate([each for each in rows if each is not None])
+    nearest, number = [], 0
+    for row in rows:
+        if row is None or len(known) < 2:
+            nearest.append(known[:0])
+            continue
+        far = np.abs(known - row).max(axis=1)
+        far[number] = np.inf  # itself
+        nearest.append(known[far.argmin()][None])
+        number += 1
+    return nearest
 
 
 def _card(makers: Sequence[Maker]) -> Card:
