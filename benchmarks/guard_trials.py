@@ -276,9 +276,10 @@ class ControlLoop:
         options = station.options
         guard = {"type": "clearance", "floor": 0.0, "margin": MARGIN_M, "self_margin": SELF_MARGIN_M, "press": PRESS_M}
         guard |= {"may_touch": {name: list(links) for name, links in (options.may_touch or {}).items()}}
-        overrides = ["simulation={type: mujoco, scene: empty, start_pose: home}"] + [
-            f"control.guard={json.dumps(guard)}"
-        ] * guarded
+        overrides = [
+            "simulation={type: mujoco, scene: empty, start_pose: home}",
+            f"control.guard={json.dumps(guard) if guarded else 'null'}",
+        ]
         self._config = load_config(station.path, sim=True, overrides=overrides)
         self._clock, self.overruled, self.faults = SteppedClock(0), "", list[str]()
         self._control = InlineControl(self._config, installed_plugins(), self._clock, 0, self._state, self._event)

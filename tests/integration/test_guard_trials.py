@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
+import attrs
 import guard_trials
 import numpy as np
 import pytest
-from guard_trials import Judge, Station
+from guard_trials import SIZES, Commanders, Judge, Station
 from ibrobot_planning.guard.changes import WorldChange
 from ibrobot_planning.world.objects import Box, WorldObject
 
 from ibrobot_core.api import Pose, Vector3
-from ibrobot_core.control.commands import ClearFaults
+from ibrobot_core.control.commands import CancelGoals, ClearFaults, Command, EmergencyStop, RaiseFault, SwitchMode
+from ibrobot_core.errors import IbrobotError
 
 pytestmark = pytest.mark.integration
 
@@ -62,3 +65,60 @@ def test_while_the_host_is_silent_the_world_stays_known_and_then_the_arm_rests(j
     at = [loop.tick(goal)[0] for _ in range(150)]
     loop.close()
     assert at[-1] < 1.2, "the wall is still known"
+
+
+INTERRUPTIONS: tuple[Command, ...] = (
+    EmergencyStop(), RaiseFault("a test"), SwitchMode("teleop"), SwitchMode("model_inference"), CancelGoals(),
+    ClearFaults(),
+)  # fmt: skip
+
+
+def deepest(station: Station, judge: Judge, seed: int, *, guarded: bool) -> float:
+    """How near pairs come beyond what they must keep [m] while stops, modes, resets and bad readings interrupt motions.
+
+    A reset begins where the joints are: from there on, what is too near may come no nearer.
+    """
+    rng = np.random.default_rng(seed)
+    places = {"post": (0.15, 0.2, 0.2), "cube": (0.2, -0.2, 0.03), "wall": (-0.25, 0.0, 0.2)}
+    objects = {name: WorldObject(Box(SIZES[name]), Pose(Vector3(*place))) for name, place in places.items()}
+    judge.put(objects)
+    loop = guard_trials.ControlLoop(station, guarded=guarded)
+    core = loop._control._core
+    loop.world(WorldChange(objects))
+    read, least, begun = core._hardware.read, np.inf, 0.0
+
+    def spoiled() -> object:
+        reading = read()
+        if rng.random() < 0.03:
+            lost = reading.position.copy()
+            lost[rng.integers(len(lost))] = rng.choice([np.nan, np.inf, 1e9])
+            return attrs.evolve(reading, position=lost)
+        return reading
+
+    core._hardware.read = spoiled
+    commanders = Commanders(station, judge, rng)
+    for tick in range(400):
+        if tick % 100 == 0:
+            stream = commanders.stream("leader", loop.position)
+        if rng.random() < (0.1 if core.fault else 0.02):
+            act = ClearFaults() if core.fault else INTERRUPTIONS[rng.integers(len(INTERRUPTIONS))]
+            with contextlib.suppress(IbrobotError):
+                loop._control.call(act)
+            loop._generation = core.generation
+        before = core._safety.current
+        if not np.array_equal(before, loop.position):  # a reset
+            begun = min(judge.room(before)[1], 0.0)
+        least = min(least, judge.along(before, loop.tick(next(stream)))[1] - begun)
+    loop.close()
+    return float(least)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_what_interrupts_a_motion_leads_into_nothing(judged, seed: int) -> None:
+    station, judge = judged
+    assert deepest(station, judge, seed, guarded=True) > -0.001
+
+
+def test_without_the_guard_the_same_motion_touches(judged) -> None:
+    station, judge = judged
+    assert deepest(station, judge, 0, guarded=False) < -0.003
