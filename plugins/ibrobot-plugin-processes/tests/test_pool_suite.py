@@ -59,6 +59,11 @@ class Twice(Wrong):
         return [done, done]
 
 
+class OneMore(Wrong):
+    def __init__(self, jobs):
+        super().__init__(jobs + 1)
+
+
 class AllAtOnce(Wrong):
     def before(self, jobs):
         return list(itertools.islice(jobs, 100))
@@ -112,6 +117,7 @@ class GoesOn(Wrong):
 WRONG = [
     (Twice, "each_job_is_done_once"),
     (AllAtOnce, "jobs_begin_in_their_order_when_there_is_room_for_them"),
+    (OneMore, "no_more_jobs_run_than_asked"),
     (Unwatched, "progress_of_all_jobs_is_counted"),
     (PlainErrors, "error_of_a_job_is_its_own"),
     (HidesErrors, "bug_in_a_job_is_an_error"),

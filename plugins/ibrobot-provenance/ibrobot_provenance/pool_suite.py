@@ -9,7 +9,17 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
-from ibrobot_testing.pool_jobs import Order, die_if_odd, die_once, divide, fail_if_odd, process, square, wait
+from ibrobot_testing.pool_jobs import (
+    Order,
+    count_begun,
+    die_if_odd,
+    die_once,
+    divide,
+    fail_if_odd,
+    process,
+    square,
+    wait,
+)
 from ibrobot_testing.suite import Suite, wait_until
 
 from ibrobot_provenance.jobs import Job, Pool
@@ -60,6 +70,12 @@ class PoolSuite(Suite[Pool]):
         with self.opened(1) as pool, closing(pool.run(work())) as running:
             assert [next(running).result() for _ in range(4)] == [0, 1, 4, 9]
         assert len(taken) <= 6, "jobs are taken as there is room for them, and not all at once"
+
+    def test_no_more_jobs_run_than_asked(self, tmp_path: Path) -> None:
+        """A pool for one job at once begins the second when the first has ended."""
+        with self.opened(1) as pool:
+            done = list(pool.run([Job(count_begun, Order(number, str(tmp_path))) for number in range(2)]))
+        assert sorted(each.result() for each in done) == [1, 2], "two jobs ran at once"
 
     def test_progress_of_all_jobs_is_counted(self) -> None:
         """The last count is the sum of the progress of all jobs."""
