@@ -69,8 +69,9 @@ class Commands(click.Group):
         if any(each.startswith(f"{name} ") for each in registry.commands):
             return Commands(name)
         if name not in registry.commands:
-            if name in registry.official("command"):
-                raise registry.not_found("command", name)
+            for each in (name, self._prefix.strip()):  # the words above may be a command that is not installed
+                if each in registry.official("command") and each not in registry.commands:
+                    raise registry.not_found("command", each)
             return None
         return _click_command(registry.command(name))
 

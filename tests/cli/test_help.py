@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -73,6 +74,14 @@ def test_command_of_a_missing_plugin_names_the_package(
     ran = ibrobot(command, "so101")
 
     message = f"error: ibrobot {command} needs a plugin that is not installed: pip install ibrobot-plugin-data\n"
+    assert (ran.code, ran.out, ran.err) == (2, "", message)
+
+
+@pytest.mark.skipif(find_spec("ibrobot_terminal") is not None, reason="has the command")
+def test_command_below_one_that_is_not_installed_names_the_package(ibrobot: Ibrobot) -> None:
+    ran = ibrobot("plugins", "show", "wave")
+
+    message = "error: ibrobot plugins needs a plugin that is not installed: pip install ibrobot-terminal\n"
     assert (ran.code, ran.out, ran.err) == (2, "", message)
 
 
