@@ -92,8 +92,8 @@ class NewPlugin:
         echo(f"{made['folder']}: {len(made['files'])} files")
         if made["entered"]:
             echo(f"entered in {', '.join(made['entered'])}")
-            here = shlex.quote(made["root"])
-            echo(f"next: cd {here} && uv sync --group cluster && uv run python tests/house/official_plugins.py")
+            root = shlex.quote(made["root"])
+            echo(f"next: cd {root} && uv sync --group cluster && uv run python tests/house/official_plugins.py")
             lists = "tests/test_distributions.py tests/house/test_names.py tests/docs/test_entrances_listed.py"
             echo(f"then: uv run pytest plugins/{Path(made['folder']).name}/tests {lists}")
             return
