@@ -34,6 +34,8 @@ function: the smallest implementation, which passes the suite of its kind. The p
 `new/TYPE.jinja`, whose macros replace those of `templates/kind.jinja`.
 """
 FOLDER = "new"
+_YAML_WORDS = ("null", "true", "false", "yes", "no", "on", "off")
+"""What YAML takes for something else than text."""
 
 
 @attrs.frozen
@@ -59,7 +61,7 @@ class NewPlugin:
         """Write it, completely or not at all."""
         if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", self.name):
             raise RequestError(f"NAME is {self.name!r}: use lower-case letters, digits and _, e.g. my_arm")
-        is_word = keyword.iskeyword(self.name) or self.name in ("null", "true", "false")
+        is_word = self.name in _YAML_WORDS or keyword.iskeyword(self.name) or keyword.iskeyword(self.name.capitalize())
         if is_word or find_spec(f"ibrobot_{self.name}") is not None:
             taken = "a word of Python or of YAML" if is_word else f"ibrobot_{self.name}, which is installed"
             raise RequestError(f"NAME is {self.name!r}: that is {taken}; choose another")

@@ -109,7 +109,7 @@ def test_name_that_no_module_can_have_is_an_error(tmp_path: Path, name: str) -> 
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["class", "null", "core", "testing"])
+@pytest.mark.parametrize("name", ["class", "none", "null", "no", "off", "on", "yes", "core", "testing"])
 def test_name_that_is_taken_is_an_error(tmp_path: Path, name: str) -> None:
     with pytest.raises(
         RequestError, match=r"that is (a word of Python or of YAML|ibrobot_\w+, which is installed); choose another"
