@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "shared"))
 from ibrobot_diagnose.pictures import shrink
 from ibrobot_diagnose.rig import STILL_WIDTH, Still
-from made_rigs import JOINTS, compared, rig
+from made_rigs import compared, rig
+from made_runs import JOINTS
 
 type Picture = NDArray[np.uint8]
 
