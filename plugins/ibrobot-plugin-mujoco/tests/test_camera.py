@@ -358,7 +358,9 @@ def drawn_and_closed(frames: list[Any]) -> None:
 
 @pytest.mark.parametrize("step", ["making", "reading", "freeing"])
 def test_renderers_of_two_threads_never_use_opengl_at_once(step: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    frames, overlaps, entered = [], [], threading.Event()
+    frames: list[Any] = []
+    overlaps: list[bool] = []
+    entered = threading.Event()
     other = threading.Thread(target=drawn_and_closed, args=(frames,))
     context = import_module(f"mujoco.{gl.choose()}").GLContext
     steps: tuple[tuple[str, Any, str], ...] = (
