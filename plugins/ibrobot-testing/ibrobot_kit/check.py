@@ -51,7 +51,7 @@ class Watch:
 sys.meta_path.insert(0, Watch())
 importlib.import_module(module)
 loaded = [name for name in json.loads(heavy) if name in sys.modules and name not in before]
-print(json.dumps({name: lines.get(name, "") for name in loaded}))
+print("\\nloaded", json.dumps({name: lines.get(name, "") for name in loaded}))
 """
 """Imports a module, and prints which heavy packages that imports, each with the line of the module's package that
 brings it."""
@@ -148,10 +148,11 @@ def _weight(module: str, required: Sequence[str]) -> Check:
     """Check which heavy packages discovery imports because of `module`, beyond those of `required`; name the lines."""
     command = [sys.executable, "-c", _WEIGHED, module, json.dumps(HEAVY), *required]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-    if done.returncode:
+    told_of = [line for line in done.stdout.splitlines() if line.startswith("loaded {")]
+    if done.returncode or not told_of:
         lines = done.stderr.strip().splitlines() or ["it ended without a word"]
         return Check("weight", False, f"{module} cannot be imported alone: {lines[-1]}")
-    loaded: dict[str, str] = json.loads(done.stdout.splitlines()[-1])
+    loaded: dict[str, str] = json.loads(told_of[-1].removeprefix("loaded "))
     told = ", ".join(f"{name} ({line})" if line else name for name, line in loaded.items())
     remedy = (
         'each ibrobot command imports that: import it in `make`, e.g. by Late("MODULE:NAME"), '

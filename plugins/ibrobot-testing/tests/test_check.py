@@ -176,6 +176,11 @@ def test_place_that_a_function_uses_is_looked_at(site: Site, made: str, found: s
     assert f"ibrobot_testing.fakes.host:{made} {found}" in every[1]
 
 
+def test_what_a_module_prints_does_not_disturb_the_check(site: Site) -> None:
+    install(site, "import atexit\nprint('no line', end='')\natexit.register(print, 'loaded: bye')\n" + PLUGIN)
+    assert checks()["weight"].found == "fake_wave imports nothing heavy"
+
+
 def test_class_that_makes_the_object_is_looked_at(site: Site) -> None:
     wave = "\n\nfrom ibrobot_core.api import Teleop\n\n\nclass Wave(Teleop):\n    read = connect = disconnect = print\n"
     install(site, PLUGIN.replace('Late("ibrobot_testing.fakes.host:FakeTeleop")', "Wave") + wave)
