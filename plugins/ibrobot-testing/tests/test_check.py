@@ -177,7 +177,10 @@ def test_place_that_a_function_uses_is_looked_at(site: Site, made: str, found: s
 
 
 def test_what_a_module_prints_does_not_disturb_the_check(site: Site) -> None:
-    install(site, "import atexit\nprint('no line', end='')\natexit.register(print, 'loaded: bye')\n" + PLUGIN)
+    alone = (
+        "import atexit, sys\nif sys.argv[0] == '-c': print('no line', end=''), atexit.register(print, 'loaded: bye')\n"
+    )
+    install(site, alone + PLUGIN)
     assert checks()["weight"].found == "fake_wave imports nothing heavy"
 
 
