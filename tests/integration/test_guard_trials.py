@@ -13,7 +13,7 @@ from guard_trials import SIZES, Commanders, Judge, Station
 from ibrobot_planning.guard.changes import WorldChange
 from ibrobot_planning.world.objects import Box, WorldObject
 
-from ibrobot_core.api import Pose, Vector3
+from ibrobot_core.api import JointReading, Pose, Vector3
 from ibrobot_core.control.commands import CancelGoals, ClearFaults, Command, EmergencyStop, RaiseFault, SwitchMode
 from ibrobot_core.errors import IbrobotError
 
@@ -87,7 +87,7 @@ def deepest(station: Station, judge: Judge, seed: int, *, guarded: bool) -> floa
     loop.world(WorldChange(objects))
     read, least, begun = core._hardware.read, np.inf, 0.0
 
-    def spoiled() -> object:
+    def spoiled() -> JointReading:
         reading = read()
         if rng.random() < 0.03:
             lost = reading.position.copy()
@@ -95,7 +95,7 @@ def deepest(station: Station, judge: Judge, seed: int, *, guarded: bool) -> floa
             return attrs.evolve(reading, position=lost)
         return reading
 
-    core._hardware.read = spoiled
+    core._hardware.read = spoiled  # type: ignore[method-assign]
     commanders = Commanders(station, judge, rng)
     for tick in range(400):
         if tick % 100 == 0:

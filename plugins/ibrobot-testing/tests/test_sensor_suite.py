@@ -233,10 +233,12 @@ def test_fake_waits_for_its_next_message_and_not_longer_than_its_time_out():
     sensor = FakeImu(context)
     sensor.open()
     first = sensor.read(1.0)
+    assert first is not None
     assert sensor.read(0.004) is None
     assert context.clock.now_ns() == first.header.stamp_ns + 4_000_000
     second = sensor.read(1.0)
     sensor.close()
+    assert second is not None
     assert second.header.stamp_ns == first.header.stamp_ns + context.period_ns == context.clock.now_ns()
 
 

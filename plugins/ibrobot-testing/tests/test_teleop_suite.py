@@ -208,7 +208,7 @@ def test_catches(wrong, caught_by, tmp_path):
 
 def test_button_of_an_unknown_event_is_refused(tmp_path):
     class Suite(TestTeleop):
-        events = ("success", "jump")
+        events = ("success", "jump")  # type: ignore[assignment]
 
     assert failed_checks(Suite, tmp_path) == {"each_press_is_one_event"}
 
