@@ -28,7 +28,7 @@ from ibrobot_core.app import RequestError, RobotConfig, echo, find_config, insta
 
 
 @attrs.frozen(eq=False)
-class Found:
+class CameraMount:
     """Where a camera is mounted, and the robot YAML that this belongs into."""
 
     source: Path
@@ -92,15 +92,15 @@ class MountCamera(Board):
 
     @wrong_input()
     def __call__(self) -> Mounting:
-        found = self.found()
+        mount = self.measured()
         if self.write:
-            found.save()
-            echo(f"{found.source}: the mount of {found.camera} is written")
+            mount.save()
+            echo(f"{mount.source}: the mount of {mount.camera} is written")
         else:
-            echo(f"  {found.line}")
-        return found.mounting
+            echo(f"  {mount.line}")
+        return mount.mounting
 
-    def found(self) -> Found:
+    def measured(self) -> CameraMount:
         """The mount, which is not written.
 
         Raises:
@@ -134,7 +134,9 @@ class MountCamera(Board):
             shots += taken.shots
             told.append(taken.text())
         assert lens is not None
-        return Found(source, camera, link, solve_mount(Session(shots, chain, lens, measured), f": {'; '.join(told)}"))
+        return CameraMount(
+            source, camera, link, solve_mount(Session(shots, chain, lens, measured), f": {'; '.join(told)}")
+        )
 
     def show(self, result: Mounting) -> None:
         """Print the result."""
@@ -206,16 +208,16 @@ def guided(answers: Mapping[str, str | bool], guide: Guide) -> None:
     """
     given = {name: str(answer).strip() for name, answer in answers.items()}
     board = board_of(answers)
-    found = MountCamera(
+    mount = MountCamera(
         columns=board.columns, rows=board.rows, square=board.square, robot=given["robot"],
         episodes=(Path(given["episode"]).expanduser(),), camera=given["camera"], on=given["on"],
         board_on=given["board_on"], sim=answers["simulated"] is True,
-    ).found()  # fmt: skip
-    for line in found.mounting.lines():
+    ).measured()  # fmt: skip
+    for line in mount.mounting.lines():
         guide.say(line)
-    guide.say(found.line)
-    if found.source.resolve() in {path.resolve() for path in installed_plugins().shipped_configs().values()}:
+    guide.say(mount.line)
+    if mount.source.resolve() in {path.resolve() for path in installed_plugins().shipped_configs().values()}:
         guide.say("This robot is shipped with ibrobot: put the line into a robot YAML of your own.")
-    elif guide.confirm(f"Write it into {found.source}?", flag="--write"):
-        found.save()
-        guide.say(f"{found.source}: the mount of {found.camera} is written")
+    elif guide.confirm(f"Write it into {mount.source}?", flag="--write"):
+        mount.save()
+        guide.say(f"{mount.source}: the mount of {mount.camera} is written")

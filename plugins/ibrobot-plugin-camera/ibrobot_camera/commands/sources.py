@@ -27,7 +27,7 @@ def opened(source: str, one: str | None = None) -> Iterator[dict[str, OpenCvCame
 
     Args:
         source: a device or the path of a robot YAML.
-        one: the name of the only camera to open; empty for the only one that there is; None to open all.
+        one: the name of the only camera to open; empty for the only camera; None to open all.
 
     Raises:
         ConfigError: if the robot YAML has mistakes.

@@ -26,10 +26,10 @@ def find_corners(grey: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.f
         grey: shape (H, W).
         size: number of inner corners in a row, and in a column.
     """
-    seen, found = cv2.findChessboardCorners(grey, size, flags=_FLAGS)
-    if not seen or found is None:
+    seen, rough = cv2.findChessboardCorners(grey, size, flags=_FLAGS)
+    if not seen or rough is None:
         return None
-    corners = np.asarray(found, np.float32).reshape(-1, 2)
+    corners = np.asarray(rough, np.float32).reshape(-1, 2)
     if corners[-1, 0] < corners[0, 0]:
         corners = np.ascontiguousarray(corners[::-1])
     windows = windows_of(corners, size)
