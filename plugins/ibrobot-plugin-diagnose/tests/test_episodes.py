@@ -129,5 +129,15 @@ def test_copy_is_named_wherever_it_stands_in_the_dataset(others):
     assert len(ways[3]) == 0
 
 
+def test_ways_of_no_episodes_and_of_robots_with_other_joints_are_not_compared():
+    assert check.nearest_ways([]) == []
+    moved = 0.02 * np.arange(120)[:, None]
+    makers = [Maker() for _ in range(4)]
+    assert [len(each) for each in check.nearest_ways(makers)] == [0] * 4
+    for maker, joints in zip(makers, (2, 3, 3, 1), strict=True):
+        maker.add(make_window(np.repeat(moved, joints, axis=1)))
+    assert [len(each) for each in check.nearest_ways(makers)] == [0, 1, 1, 0]
+
+
 def with_ways(reference, ways):
     return Reference(attrs.evolve(reference.card, ways=ways))

@@ -118,19 +118,19 @@ def _checked(
 def nearest_ways(makers: Sequence[Maker]) -> list[Floats]:
     """The way of another episode that is nearest to that of each, whatever their parts, shape (1, WAY * J) each.
 
-    None at all, shape (0, WAY * J), of an episode that has no way.
+    No row for an episode that has no way, or that is the only one with as many joints.
     """
-    rows = [each.ways[0] if each.ways else None for each in makers]
-    known = np.concatenate([each for each in rows if each is not None])
-    nearest, number = [], 0
+    rows = [each.ways[0] if each.ways else np.empty((1, 0)) for each in makers]
+    known = {
+        size: np.concatenate([each for each in rows if each.size == size]) for size in {each.size for each in rows}
+    }
+    nearest, numbers = [], Counter[int]()
     for row in rows:
-        if row is None or len(known) < 2:
-            nearest.append(known[:0])
-            continue
-        far = np.abs(known - row).max(axis=1)
-        far[number] = np.inf  # itself
-        nearest.append(known[far.argmin()][None])
-        number += 1
+        others = known[row.size]
+        far = np.abs(others - row).max(axis=1, initial=0.0)
+        far[numbers[row.size]] = np.inf  # itself
+        numbers[row.size] += 1
+        nearest.append(others[[far.argmin()]] if row.size and len(others) > 1 else others[:0])
     return nearest
 
 
