@@ -1,4 +1,4 @@
-"""How often `ibrobot explain` names faults that are laid over recordings of a real arm.
+"""How often `ibrobot explain` names faults that are added to recordings of a real arm.
 
     python benchmarks/explain_real.py DATASET [--data 12] [--held 4] [--faults NAME ...]
 
@@ -85,12 +85,12 @@ def _unchanged() -> Callable[[Pixels, float], Pixels]:
 
 @attrs.frozen
 class Fault:
-    """A fault that is laid over a recording."""
+    """A fault that is added to a recording."""
 
     looks: Callable[[], Callable[[Pixels, float], Pixels]] = _unchanged
-    """Makes what becomes of the pictures of the first camera."""
+    """Makes the function that changes the pictures of the first camera."""
     reads: Callable[[Floats], Floats] = lambda positions: positions
-    """What becomes of positions and commands [rad], shape (N, J)."""
+    """Changes positions and commands [rad], shape (N, J)."""
     exchanged: bool = False
     """Whether the first two cameras have each other's place."""
 
@@ -169,7 +169,7 @@ def seen(episode: Path, fault: Fault) -> Window:
 
 
 def with_fault(episode: Path, plain: Window, fault: Fault) -> Window:
-    """A recording with a fault; it is read again only if its pictures become others."""
+    """A recording with a fault; it is read again only if its pictures change."""
     recording = plain if fault.looks is _unchanged and not fault.exchanged else seen(episode, fault)
     state, command = (
         attrs.evolve(each, values=fault.reads(each.values)) for each in (recording.state, recording.command)

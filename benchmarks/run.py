@@ -234,7 +234,7 @@ CLAIMS = (
     ),
     Claim(
         "explain_real",
-        "of faults that are laid over recordings of a real robot, `ibrobot explain` names most first, and nothing where"
+        "of faults that are added to recordings of a real robot, `ibrobot explain` names most first, and nothing where"
         " there is none",
         "docs/how-to/explain-a-failure.md",
         "explain_real.py DATASET --data 10 --held 6",
