@@ -92,7 +92,7 @@ IS_FIRST = "NOX_NOT_TESTED" not in os.environ
 NOT_TESTED = Path(os.environ.setdefault("NOX_NOT_TESTED", str(Path(f".nox/not-tested-{os.getpid()}").absolute())))
 """The file of what no session could test on this machine, and what to do about it."""
 PROCESSOR = Path(os.environ.setdefault("NOX_PROCESSOR", str(Path(f".nox/processor-{os.getpid()}").absolute())))
-"""The file of how much time of processors each session took."""
+"""The file with the processor time of each session."""
 if not IS_FIRST and "integration" not in sys.argv:
     # All others end beside the longest one if they leave the processor to it. Linux shares the processor among the
     # sessions of processes first, and each of nox is one.

@@ -79,7 +79,7 @@ def cloud(rng: np.random.Generator, cells: int = CELLS) -> WorldObject:
 def aimed(
     station: Station, judge: Judge, world: Mapping[str, WorldObject], ticks: int
 ) -> Iterator[tuple[Loop, Callable[[], object]]]:
-    """The safety layer with the guard, and what has it take a tick with the next command of changing commanders."""
+    """Yield the safety layer with the guard, and a function that runs its next tick; commanders take turns."""
     rng = np.random.default_rng(0)
     judge.put({})
     loop = Loop(station, np.zeros(len(station.robot.joints)))

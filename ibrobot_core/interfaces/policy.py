@@ -187,7 +187,7 @@ class Policy(ABC):
 
     @abstractmethod
     def postprocess(self, tensors: Tensors) -> NDArray[np.float64]:
-        """Make actions of outputs: a new array (N, A), 1 <= N <= `chunk_size`, in the contract's units and order."""
+        """Convert outputs to actions: a new array (N, A), 1 <= N <= `chunk_size`, in the contract's units and order."""
 
     def infer_batch(self, batch: Sequence[Tensors]) -> list[Tensors]:
         """Compute the outputs of several inputs, in order. All inputs have the same names, dtypes and shapes.

@@ -99,7 +99,7 @@ class Plugins(Protocol):
 
 
 class MotionScope:
-    """What all motion keeps to. This is the scope without agents; `ibrobot_terminal.authority` has that of a grant."""
+    """Limits of all motion. This one is that without agents; `ibrobot_terminal.authority` has that of a grant."""
 
     acting: ClassVar[ContextVar[Any]] = ContextVar("acting agent", default=None)
     """The agent for which the present thread works; None for a person."""

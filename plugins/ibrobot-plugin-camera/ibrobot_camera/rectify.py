@@ -19,7 +19,7 @@ _COEFFICIENTS: Mapping[str, tuple[int, ...]] = {
 _MATRICES: Mapping[str, tuple[int, int]] = {"k": (3, 3), "r": (3, 3), "p": (3, 4)}
 _LARGEST_PX = 8192
 _PARTS = 32
-"""Places between two pixels that OpenCV's maps tell apart."""
+"""Steps into which OpenCV's maps divide the distance of two pixels."""
 
 
 @attrs.frozen(eq=False, slots=False)
@@ -46,7 +46,7 @@ class Rectifier:
 
     @classmethod
     def of(cls, lens: Mapping[str, Any]) -> Rectifier:
-        """The rectifier for intrinsics as a contract has them, which may come from a recording of anybody.
+        """The rectifier for the intrinsics in a contract, which may come from an untrusted recording.
 
         Raises:
             ContractError: if they are not those of a camera.
@@ -94,7 +94,7 @@ class Rectifier:
 
     @cached_property
     def _maps(self) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-        """Where each pixel comes from, in pixels, (H, W, 2), and parts of them, (H, W)."""
+        """Source of each pixel: whole pixels, shape (H, W, 2), and the index of the fraction, shape (H, W)."""
         import cv2
 
         make = cv2.fisheye.initUndistortRectifyMap if self.model == "equidistant" else cv2.initUndistortRectifyMap
@@ -104,7 +104,7 @@ class Rectifier:
 
 
 def facts_of(info: CameraInfo) -> dict[str, Any]:
-    """Intrinsics as a contract has them."""
+    """The intrinsics in the form of a contract."""
     matrices = {name: getattr(info, name).tolist() for name in ("d", *_MATRICES)}
     return {"width": info.width, "height": info.height, "distortion_model": info.distortion_model, **matrices}
 

@@ -392,7 +392,7 @@ class DamiaoBus:
         return messages
 
     def _has_arrived(self) -> bool | None:
-        """Whether there is something to read, at least a part of a frame; None if only a read can tell."""
+        """Whether at least a part of a frame can be read now; None if only a read can tell."""
         try:
             return bool(select.select([self._opened()], [], [], 0)[0])
         except (NotImplementedError, ValueError, OSError, can.CanError):  # no file descriptor, or one that is gone

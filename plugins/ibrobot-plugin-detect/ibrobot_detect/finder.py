@@ -97,7 +97,7 @@ class Finder(Component):
     @override
     def stop(self) -> None:
         self._session.bus.unserve(FIND)
-        with self._lock, ExitStack() as stack:  # one that raises keeps no other open
+        with self._lock, ExitStack() as stack:  # if one raises, the others are still closed
             for detector, _ in self._detectors.values():
                 stack.callback(detector.close)
             self._detectors.clear()

@@ -224,7 +224,7 @@ class Diagnosis:
     """Those of the untested that have a mistake, and the plugins that failed, which may offer causes."""
 
     def source_of(self, number: int) -> int | None:
-        """The finding that brings another one about, both by their place; None if it stands for itself."""
+        """Index of the first earlier finding that explains this one; None if there is none."""
         finding = self.findings[number]
         return next((i for i, each in enumerate(self.findings[:number]) if each.explains(finding)), None)
 

@@ -51,16 +51,14 @@ class Explanation:
         )
 
     def to_do(self, number: int) -> str:
-        """What to do about a finding: its remedy, but first what brings it about."""
+        """What to do about a finding: its remedy, or first that of the finding that causes it."""
         findings = self.diagnosis.findings
         remedy = findings[number].cause.remedy
         if (source := self.diagnosis.source_of(number)) is not None:
-            first = "what the first line says" if not source else f"number {source + 1}"
-            return f"First mend {first}: this is probably a consequence of it."
+            first = "the first cause" if not source else f"cause {source + 1}"
+            return f"Fix {first} first: this is probably a consequence of it."
         if number and findings[number].cause.weak and not findings[0].cause.weak:
-            return (
-                f"First mend what the first line says. If the policy still errs then: {remedy[0].lower()}{remedy[1:]}"
-            )
+            return f"Fix the first cause first. If the policy still fails then: {remedy[0].lower()}{remedy[1:]}"
         return remedy
 
     def facts(self, *, ticks: bool = False) -> dict[str, Any]:

@@ -605,14 +605,14 @@ def test_check_of_a_dataset_names_a_cause_with_a_mistake(monkeypatch, data):
     assert lines[-1] == "All 2 episodes are like one another: nothing was found."
 
 
-def test_what_the_first_cause_brings_about_is_mended_by_mending_that(data):
+def test_consequence_of_the_first_cause_says_to_fix_that_first(data):
     run = Run(seed=9400, outcome="failure", guarded=(0.1, 0.9), **NONE, **JOINTS["gripper_reversed"][2])
     window = window_of(run)
     explanation = Explanation.of(window, data, diagnose(window, data))
     done = {each["name"]: each["to_do"] for each in explanation.facts()["causes"]}
     assert next(iter(done)) == "gripper_reversed"
     assert done["gripper_reversed"].startswith("Calibrate the gripper again")
-    assert done["guard_held"] == "First mend what the first line says: this is probably a consequence of it."
+    assert done["guard_held"] == "Fix the first cause first: this is probably a consequence of it."
     assert f"   What to do: {done['guard_held']}" in explanation.lines()
 
 
@@ -625,7 +625,7 @@ def test_what_the_first_cause_brings_about_is_mended_by_mending_that(data):
         ({"gain": {0: 0.2}}, "following"),
     ],
 )
-def test_what_parts_the_arm_from_the_answers_has_the_largest_share(options, part):
+def test_planted_deviation_from_the_answers_has_the_largest_share(options, part):
     window = window_of(Run(seed=9410, cameras=(), **options))
     explanation = Explanation.of(window, Reference(), diagnose(window, Reference()))
     shares = explanation.facts()["between"]["mean_difference_rad"]

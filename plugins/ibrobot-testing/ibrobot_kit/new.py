@@ -210,7 +210,7 @@ def _check_free(registry: Registry, kind: str, name: str, facts: Mapping[str, An
     offered = registry.entries.get((kind, name))
     package = registry.command_packages.get(name, "") if kind == "command" else offered.package if offered else ""
     if package:
-        raise RequestError(f"NAME is {name!r}: {package} has a {kind} of this name; choose another, e.g. my_{name}")
+        raise RequestError(f"NAME is {name!r}: {package} has the {kind} already; choose another, e.g. my_{name}")
     descriptor = Late(f"{facts['descriptor_module']}:{facts['descriptor']}").load()
     if not issubclass(descriptor, Descriptor):
         return

@@ -138,7 +138,7 @@ def test_name_that_the_package_itself_needs_is_an_error(tmp_path: Path, kind: st
 )
 def test_type_that_another_package_offers_is_an_error(tmp_path: Path, kind: str, name: str, package: str) -> None:
     with pytest.raises(
-        RequestError, match=f"^NAME is '{name}': {package} has a {kind} of this name; choose another, e.g. my_{name}$"
+        RequestError, match=f"^NAME is '{name}': {package} has the {kind} already; choose another, e.g. my_{name}$"
     ):
         NewPlugin(kind, name, tmp_path)()
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""Offers two kinds of one name with the same options."""
+"""A plugin with two kinds of the same name and the same options."""
 
 from __future__ import annotations
 

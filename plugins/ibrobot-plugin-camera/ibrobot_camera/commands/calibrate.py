@@ -51,7 +51,7 @@ class MakeBoard(Board):
 class CalibrateCamera(Board):
     """Measure the lens of a camera with a printed board; see `ibrobot camera board`.
 
-    A plain chessboard does, too, with --chessboard; --columns and --rows count its squares, not its inner corners.
+    With --chessboard, a plain chessboard does; --columns and --rows count its squares, not its inner corners.
 
     SOURCE is a device, a robot YAML with one `opencv` camera or with --camera, or a folder of pictures. Of a camera,
     pictures are taken by themselves while you show the board: hold it still for a moment in each place. The focus must
@@ -65,7 +65,7 @@ class CalibrateCamera(Board):
     output: Path | None = option(
         None, typed="-o FILE", help="the file to write, by default NAME.yaml; it is replaced if it exists"
     )
-    chessboard: bool = option(False, help="the board is a plain chessboard, without markers, and seen whole")
+    chessboard: bool = option(False, help="the board is a plain chessboard without markers; show all of it")
     views: int = option(VIEWS, ge=FEWEST_VIEWS, le=200, help="number of views to take")
     seconds: float = option(300.0, gt=0, unit="s", help="time after which the views that were taken must suffice")
 
@@ -103,8 +103,8 @@ class CalibrateCamera(Board):
         if not views:
             corners = f"{self.columns - 1} x {self.rows - 1} inner corners"
             seen = f"chessboard with {corners}" if self.chessboard else f"board with markers and {corners}"
-            other = "" if self.chessboard else "; a plain chessboard needs --chessboard"
-            raise SensorError(f"{folder}: no picture shows a {seen}: do --columns and --rows count the squares?{other}")
+            other = "" if self.chessboard else ", and a plain chessboard needs --chessboard"
+            raise SensorError(f"{folder}: no picture shows a {seen}; --columns and --rows count squares{other}")
         return views
 
     def _find(self, picture: NDArray[np.uint8], name: str) -> View | None:

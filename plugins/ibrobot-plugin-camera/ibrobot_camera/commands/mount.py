@@ -29,7 +29,7 @@ from ibrobot_core.app import RequestError, RobotConfig, echo, find_config, insta
 
 @attrs.frozen(eq=False)
 class CameraMount:
-    """Where a camera is mounted, and the robot YAML that this belongs into."""
+    """The measured mount of a camera, and the robot YAML to write it to."""
 
     source: Path
     camera: str
@@ -38,11 +38,11 @@ class CameraMount:
 
     @property
     def line(self) -> str:
-        """What the robot YAML says of it."""
+        """The line of the robot YAML."""
         return f"transform: {{parent: {self.link}, xyz: {list(self.mounting.xyz)}, rpy: {list(self.mounting.rpy)}}}"
 
     def save(self) -> None:
-        """Put it into the robot YAML, and keep the rest as it is.
+        """Write it to the robot YAML, and keep the rest as it is.
 
         Raises:
             SensorError: if that cannot be written.
@@ -101,7 +101,7 @@ class MountCamera(Board):
         return mount.mounting
 
     def measured(self) -> CameraMount:
-        """The mount, which is not written.
+        """Measure the mount without writing it.
 
         Raises:
             IbrobotError: if the robot or an episode cannot be read, or cannot tell the mount.
@@ -187,7 +187,7 @@ def _info(config: RobotConfig, camera: str) -> CameraInfo | None:
 
 
 def questions() -> tuple[Question, ...]:
-    """Of the guide for pages."""
+    """The questions that a page asks."""
     return (
         Question("robot", "Robot YAML", "so101"),
         Question("episode", "Recorded episode in which the camera sees the board", "episodes/board:0"),

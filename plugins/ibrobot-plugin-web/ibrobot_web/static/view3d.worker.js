@@ -162,7 +162,7 @@ function draw(now = 0) {
   dirty = false;
   look();
   const gray = dark ? [0.3, 0.37, 0.43, 1] : [0.68, 0.73, 0.77, 1];
-  // Of an object that one sees through, one still does: it may hide the arm.
+  // A transparent object stays transparent, since it may hide the arm.
   const things = extras.map((each) => (near.includes(each.name) ? { ...each, color: [...NEAR.slice(0, 3), each.color[3] ?? 1] } : each));
   const shown = [{ shape: grid, matrix: identity(), color: gray }, ...things];
   if (measured) shown.push(...items(measured), { shape: path, matrix: identity(), color: [0.08, 0.47, 0.78, 1] });
