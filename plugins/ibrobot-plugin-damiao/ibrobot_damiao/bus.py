@@ -413,8 +413,13 @@ class DamiaoBus:
             try:
                 message = self._opened().recv(max(0.0, until_s - time.monotonic()))
             except (can.CanError, SerialException, OSError) as error:
-                raise BusError(f"{self.place()}: has failed: {error}; {self.channel.remedy}") from error
-            except (ValueError, IndexError):  # a damaged line of a serial adapter
+                bus = self._opened()
+                if not (isinstance(bus, slcanBus) and isinstance(error.__cause__, UnicodeError)):
+                    raise BusError(f"{self.place()}: has failed: {error}; {self.channel.remedy}") from error
+                bus._buffer.clear()  # a damaged line that is no text, which python-can would read again and again
+                self.counters["strange_frames"] += 1
+                continue
+            except (ValueError, IndexError):  # another damaged line of a serial adapter
                 self.counters["strange_frames"] += 1
                 continue
             if message is None or not message.is_error_frame:
