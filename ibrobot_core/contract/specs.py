@@ -315,11 +315,10 @@ def _selection(type_: str, paths: Sequence[str], model: Mapping[str, Any], joint
 
 def _recorded_observation(key: str, part: Mapping[str, Any]) -> ObservationPart:
     """The observation part of a canonical form."""
-    align = Align(**part["align"])
+    align, model = Align(**part["align"]), dict(part.get("model", {}))
     if part["encoding"] is None:
-        return _vector(key, part["topic"], part["type"], part["select"], align, part.get("model", {}))
+        return _vector(key, part["topic"], part["type"], part["select"], align, model)
     height, width, _ = part["shape"]
-    model = part.get("model", {})
     image = ImageSpec((height, width) if min(height, width) > 0 else None, part["encoding"], "rectify" in model)
     return ObservationPart(key, part["topic"], part["type"], (), image, align, _image_feature(image, None), model)
 

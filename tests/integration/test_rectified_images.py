@@ -144,6 +144,14 @@ def test_a_policy_fits_any_lens_but_no_picture_that_is_not_rectified(tmp_path: P
         check_policy(distorted, policy)
 
 
+@pytest.mark.parametrize("model", [5, None, "rectify", ["rectify"], [["rectify"]]])
+def test_a_recorded_contract_with_a_damaged_model_is_refused(tmp_path: Path, model: Any) -> None:
+    recorded = Contract.from_config(load_config(robot(tmp_path), sim=True)).canonical()
+    recorded["observations"][TOP][0]["model"] = model
+    with pytest.raises(ContractError, match="not a recorded contract"):
+        Contract.from_canonical(recorded)
+
+
 @pytest.mark.parametrize(
     ("calibration", "message"),
     [

@@ -122,7 +122,9 @@ def _matrix(lens: Mapping[str, Any], name: str) -> NDArray[np.float64]:
     if numbers.size != rows * columns:
         raise ContractError(f"rectify: {name}: must have {rows * columns} numbers, not {numbers.size}")
     matrix = numbers.reshape(rows, columns)[:, :3]
-    if abs(np.linalg.det(matrix)) < 1e-9 or not np.diag(matrix).all():
+    with np.errstate(over="ignore", invalid="ignore"):
+        volume = abs(np.linalg.det(matrix))
+    if not 1e-9 <= volume < np.inf or not np.diag(matrix).all():
         raise ContractError(f"rectify: {name}: {numbers.tolist()} is not the matrix of a camera")
     return matrix
 
@@ -132,7 +134,7 @@ def _numbers(lens: Mapping[str, Any], name: str) -> NDArray[np.float64]:
     given = lens.get(name)
     try:
         numbers = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = np.array(np.nan)
     if numbers.ndim != 1 or not np.isfinite(numbers).all():
         raise ContractError(f"rectify: {name}: must be a list of finite numbers, not {given!r}")
