@@ -389,9 +389,11 @@ def authority_of(session: RunView) -> Authority:
     run: Any = session
     with _asking:
         if not isinstance(run.authority, Authority):
-            run.authority = Authority(session)
-    made: Authority = run.authority
-    return made
+            made = Authority(session)
+            made.lock = run.authority.lock  # those who send now hold it
+            run.authority = made
+    authority: Authority = run.authority
+    return authority
 
 
 def _cut(text: str, most: int) -> str:

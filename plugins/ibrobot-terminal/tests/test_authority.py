@@ -61,6 +61,15 @@ def test_plan_that_was_admitted_does_not_overtake_the_end_of_the_authority() -> 
     authority.close()
 
 
+def test_authority_of_a_run_keeps_the_lock_of_those_who_send() -> None:
+    """A plan may be on its way while the first door for agents, or page that shows them, asks for it."""
+    session = make_session()
+    sending = session.authority.lock
+    authority = authority_of(session)
+    assert authority.lock is sending
+    assert authority_of(session) is authority is session.authority
+
+
 def test_listener_that_stops_listening_keeps_no_event_from_the_others() -> None:
     _, authority = armed(lambda command: None, lambda plan: None)
     events: list[str] = []
