@@ -16,12 +16,12 @@ from entrance_table import read_table
 
 ROOT = Path(__file__).parents[2]
 NAMED = {name for row in read_table() for name in row.names}
+"""The entrances in the table."""
 ROW = (
     "name what moves the robot in the table `Every entrance to motion` of docs/explanation/safety.md: in the row "
     "whose cells are true of it, or in a row of its own; tests/integration/test_entrances.py then measures the cells"
 )
 """What to do about an entrance that the table does not have."""
-"""The entrances in the table."""
 KINDS = {"TeleopDescriptor": "teleop", "EngineDescriptor": "engine", "SourceDescriptor": "source"}
 """Kinds of plugins whose types are entrances of their own."""
 STILL_SERVICES = {
