@@ -27,7 +27,7 @@ _HOOK = re.compile(r"SKIPPED .*: override (\w+) to have")
 """What the suites say of a check that needs a hook."""
 _WEIGHED = """
 import importlib, json, sys
-from dis import opname
+from dis import get_instructions
 
 _, module, heavy, *required = sys.argv
 for each in required:
@@ -41,11 +41,10 @@ class Watch:
         while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] != own:
             frame = frame.f_back
         if frame is not None and name not in lines:
-            code = frame.f_code
-            instruction, argument = code.co_code[frame.f_lasti : frame.f_lasti + 2]
             # `from ibrobot_core.api import NAME` imports what NAME needs.
-            needs = f", for {code.co_names[argument]}" if opname[instruction] == "IMPORT_FROM" else ""
-            lines[name] = f"{code.co_filename}:{frame.f_lineno}{needs}"
+            here = (each for each in get_instructions(frame.f_code) if each.offset == frame.f_lasti)
+            needs = "".join(f", for {each.argval}" for each in here if each.opname == "IMPORT_FROM")
+            lines[name] = f"{frame.f_code.co_filename}:{frame.f_lineno}{needs}"
 
 
 sys.meta_path.insert(0, Watch())
@@ -55,7 +54,7 @@ print("\\nloaded", json.dumps({name: lines.get(name, "") for name in loaded}))
 """
 """Imports a module, and prints which heavy packages that imports, each with the line of the module's package that
 brings it."""
-_TESTS_S = 600.0
+_IMPORT_S, _TESTS_S = 60.0, 600.0
 _NAMED = 8
 """How many tests that fail are named."""
 
@@ -124,22 +123,27 @@ def examine(package: str, registry: Registry) -> Iterator[Check]:
 
 def _versions(package: Distribution) -> Iterator[Check]:
     """Which versions of core it permits."""
-    requirements = [Requirement(each) for each in package.requires or ()]
-    core = [each for each in requirements if each.name == _CORE]
+    core = [each for each in _requirements(package) if canonicalize_name(each.name) == _CORE]
     if not core:
         yield Check("versions", False, f"it does not require {_CORE}", f'add "{_CORE}>=0.1,<0.2" to its dependencies')
         return
-    (asked,), has = core, version(_CORE)
-    fits = asked.specifier.contains(has, prereleases=True)
+    has, asked = version(_CORE), ", ".join(map(str, core))
+    fits = all(each.specifier.contains(has, prereleases=True) for each in core)
     yield Check("versions", fits, f"{asked}; {has} is installed", f"install a version of {_CORE} that it permits")
-    if not any(each.operator in ("<", "<=", "==", "~=") for each in asked.specifier):
+    if not any(each.operator in ("<", "<=", "==", "~=") for one in core for each in one.specifier):
         remedy = "interfaces change between minor versions before 1.0: add an upper bound, e.g. <0.2"
         yield Check("versions", False, f"{asked} permits all later versions", remedy, matters=False)
 
 
+def _requirements(package: Distribution) -> list[Requirement]:
+    """What it requires on this machine, without its extras."""
+    every = [Requirement(each) for each in package.requires or ()]
+    return [each for each in every if each.marker is None or each.marker.evaluate({"extra": ""})]
+
+
 def _required(package: Distribution) -> list[str]:
     """The modules of the plugins that it requires, which discovery imports all the same."""
-    names = {canonicalize_name(Requirement(each).name) for each in package.requires or () if "extra ==" not in each}
+    names = {canonicalize_name(each.name) for each in _requirements(package)}
     points = entry_points(group="ibrobot")
     return sorted(each.module for each in points if each.dist and canonicalize_name(each.dist.name) in names)
 
@@ -147,7 +151,13 @@ def _required(package: Distribution) -> list[str]:
 def _weight(module: str, required: Sequence[str]) -> Check:
     """Check which heavy packages discovery imports because of `module`, beyond those of `required`; name the lines."""
     command = [sys.executable, "-c", _WEIGHED, module, json.dumps(HEAVY), *required]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    try:
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace", check=False,
+            timeout=_IMPORT_S,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return Check("weight", False, f"{module} cannot be imported alone: it did not end within {_IMPORT_S:g} s")
     told_of = [line for line in done.stdout.splitlines() if line.startswith("loaded {")]
     if done.returncode or not told_of:
         lines = done.stderr.strip().splitlines() or ["it ended without a word"]

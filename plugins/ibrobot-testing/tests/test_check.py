@@ -134,6 +134,22 @@ def test_line_that_imports_a_heavy_package_is_named(site: Site, statement: str, 
     assert checks()["weight"].found == f"fake_wave imports numpy ({file}:4{told})"
 
 
+def test_name_that_needs_a_heavy_package_is_right_in_a_module_with_many_names(site: Site) -> None:
+    """Beyond 256 of them, an instruction has its name in two parts."""
+    many = "".join(f"name_{number} = {number}\n" for number in range(300))
+    install(site, many + "from ibrobot_core.api import JointReading\n" + PLUGIN)
+    assert checks()["weight"].found.endswith(".py:301, for JointReading)")
+
+
+def test_module_that_does_not_end_is_an_error(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(site, "import sys, time\nif sys.argv[0] == '-c': time.sleep(600)\n" + PLUGIN)
+    monkeypatch.setattr("ibrobot_kit.check._IMPORT_S", 0.01)
+    check = checks()["weight"]
+    assert (check.ok, check.found) == (
+        False, "fake_wave cannot be imported alone: it did not end within 0.01 s",
+    )  # fmt: skip
+
+
 def test_missing_dependency_of_an_implementation_is_named(site: Site) -> None:
     install(site, PLUGIN.replace("ibrobot_testing.fakes.host:", "fake_stick:"))
     (site.folder / "fake_stick.py").write_text("import no_such_library.sticks\n")
@@ -158,6 +174,21 @@ def test_versions_that_do_not_fit_are_named(
     install(site, requires=requires)
     check = checks()["versions"]
     assert (check.ok, check.matters, check.found, check.remedy) == (False, fails, message, remedy)
+
+
+@pytest.mark.parametrize(
+    "requires",
+    [
+        "ibrobot_core>=0.1,<0.2",
+        "Ibrobot.Core>=0.1,<0.2",
+        "ibrobot-core>=0.1\nRequires-Dist: ibrobot-core<0.2",
+        "ibrobot-core>=0.1,<0.2\nRequires-Dist: ibrobot-core>=9; extra == 'next'",
+        "ibrobot-core>=0.1,<0.2\nRequires-Dist: ibrobot-core>=9; python_version < '3'",
+    ],
+)
+def test_versions_that_fit_are_found_however_they_are_written(site: Site, requires: str) -> None:
+    install(site, requires=requires)
+    assert [check.ok for check in examine("fake-wave", installed_plugins()) if check.name == "versions"] == [True]
 
 
 def test_function_that_makes_the_object_is_listed_as_not_looked_at(site: Site) -> None:
