@@ -109,7 +109,7 @@ def _given(dataset: Path, info: Mapping[str, Any]) -> dict[str, str]:
     }  # fmt: skip
     for key, feature in features.items():
         if feature.get("dtype") in ("video", "image"):
-            shape = _shape(feature)
+            shape = _shape(dataset, key, feature)
             observations[key] = [{
                 "topic": f"/{key}", "type": Image.ros_type, "select": [], "encoding": "rgb8", "shape": shape,
                 "align": {"strategy": "asof", "stamp": "header", "tol_ms": 200.0},
@@ -136,8 +136,8 @@ def _joints(dataset: Path, features: Mapping[str, Any]) -> tuple[Sequence[str], 
             raise RecorderError(
                 f"{dataset}: has no vector {key}, so joints are unknown; its features: {', '.join(features)}"
             ) from None
-        names = element_names(features[key].get("names"))
-        named.append([each.removesuffix(".pos") for each in names] if len(names) == len(set(names)) == size else [])
+        names = [each.removesuffix(".pos") for each in element_names(features[key].get("names"))]
+        named.append(names if len(names) == len(set(names)) == size else [])
         sizes.append(size)
     state, action = named
     if state and action:
@@ -151,8 +151,21 @@ def _joints(dataset: Path, features: Mapping[str, Any]) -> tuple[Sequence[str], 
     return joints, joints
 
 
-def _shape(feature: Mapping[str, Any]) -> list[int]:
-    shape, names = [int(each) for each in feature["shape"]], feature.get("names")
+def _shape(dataset: Path, key: str, feature: Mapping[str, Any]) -> list[int]:
+    """Height, width and channels of a feature's pictures.
+
+    Raises:
+        RecorderError: if it has none.
+    """
+    try:
+        shape, names = [int(each) for each in feature["shape"]], feature.get("names")
+    except (LookupError, TypeError, ValueError, OverflowError):
+        shape = []
+    if len(shape) != 3:
+        raise RecorderError(
+            f"{dataset / _INFO}: features: {key}: shape: pictures have [height, width, channels], got "
+            f"{feature.get('shape')!r}"
+        )
     if (isinstance(names, list) and names[:1] == ["channels"]) or (shape[0] == 3 and shape[-1] != 3):
         shape = [*shape[1:], shape[0]]
     return shape

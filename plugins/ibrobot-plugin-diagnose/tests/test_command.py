@@ -343,8 +343,18 @@ NAMED = ["pan", "lift", "elbow", "gripper"]
         (None, "joint_1"),
         (["state"], "joint_1"),
         (["a", "a", "a", "a"], "joint_1"),
+        (["a", "a.pos", "b", "c"], "joint_1"),
     ],
-    ids=["a list", "a list in a list", "a list in an object", "places", "none", "too few", "one for all"],
+    ids=[
+        "a list",
+        "a list in a list",
+        "a list in an object",
+        "places",
+        "none",
+        "too few",
+        "one for all",
+        "two for one",
+    ],
 )
 def test_foreign_datasets_are_read_however_they_name_joints(names, first, plain_dataset, tmp_path):
     root = as_others_write(shutil.copytree(plain_dataset, tmp_path / "set"), "v3.0", names)
@@ -375,4 +385,14 @@ def test_dataset_of_version_2_1_is_checked(plain_dataset, tmp_path):
 def test_dataset_whose_joints_are_unknown_is_refused(names, action, says, plain_dataset, tmp_path):
     root = as_others_write(shutil.copytree(plain_dataset, tmp_path / "set"), "v3.0", names, action)
     with pytest.raises(RecorderError, match=says):
+        read_episode(root.with_name("set:0"))
+
+
+@pytest.mark.parametrize("shape", [None, [], [3], ["x", 1, 2], [4, 4, 4, 3], {}])
+def test_pictures_without_a_size_are_named_with_their_feature(shape, plain_dataset, tmp_path):
+    root = as_others_write(shutil.copytree(plain_dataset, tmp_path / "set"), "v3.0", NAMED)
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"]["observation.images.top"] = {"dtype": "video", "shape": shape}
+    (root / "meta/info.json").write_text(json.dumps(info))
+    with pytest.raises(RecorderError, match=r"info.json: features: observation.images.top: shape: pictures have \[he"):
         read_episode(root.with_name("set:0"))
