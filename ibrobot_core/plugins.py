@@ -409,8 +409,10 @@ def _offered(manager: pluggy.PluginManager, hook: str, expected: type[Any] | Non
         names = {"Iterable": list, "descriptors": descriptors}
         (expected,) = get_args(get_type_hints(getattr(hookspecs, hook), names)["return"])
     caller = getattr(manager.hook, hook)
-    if len(results := caller()) < len(caller.get_hookimpls()):
-        raise TypeError("it returned None: yield what it offers")
+    results = caller()
+    wrong = next((type(each).__name__ for each in results if not isinstance(each, Iterable)), None)
+    if wrong or len(results) < len(caller.get_hookimpls()):
+        raise TypeError(f"it returned {wrong}: yield what it offers")
     offers = [each for result in results for each in result]
     for each in offers:
         if not isinstance(each, expected) or (expected is descriptors.Descriptor and type(each) is not expected):

@@ -55,6 +55,7 @@ MISTAKES = {
     "default of no choice": (OPTIONS, "option('x', choices=('a', 'b'))", "fails its own check: 'x' is not one of: a"),
     "sensor of the hook of devices": ("TeleopDescriptor(", "SensorDescriptor(", "expected a TeleopDescriptor, got "),
     "nothing yielded": ("    yield ", "    ", "it returned None: yield what it offers"),
+    "returned, not yielded": ("    yield ", "    return ", "it returned TeleopDescriptor: yield what it offers"),
     "no marks": ("@hookimpl", "", "ibrobot_teleop is not marked with @hookimpl"),
     "no hooks": (YIELDS, "", "fake_wave has no hooks: functions that are marked with @hookimpl"),
 }  # fmt: skip

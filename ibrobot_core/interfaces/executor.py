@@ -90,7 +90,8 @@ ExecutorGoal = FollowTrajectory | MoveJoint | SlowDown
 class Executor(ABC):
     """Owns joints while active. Called once per tick, from one thread.
 
-    The safety layer limits everything that an executor returns, so the executor does not need to.
+    The safety layer limits everything that an executor returns, so points of a plan may be fast. But a new goal begins
+    where the setpoint is: it makes no step beyond the velocity limits.
     """
 
     accepts_plans: ClassVar[bool] = False

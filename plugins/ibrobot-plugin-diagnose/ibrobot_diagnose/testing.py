@@ -194,6 +194,7 @@ class CauseSuite(Suite[Cause]):
         assert cause.title[:1].islower(), f"title {cause.title!r} stands in a list: begin it with a small letter"
         assert not cause.title.endswith("."), f"title {cause.title!r} is no sentence: no full stop"
         assert cause.remedy.endswith("."), f"remedy {cause.remedy!r} is a sentence: end it with a full stop"
+        assert isinstance(cause.needs, frozenset), f'needs is {cause.needs!r}: write it as frozenset({{"commands"}})'
         unknown = cause.needs - STREAMS
         assert not unknown, f"needs {', '.join(sorted(unknown))}; available: {', '.join(sorted(STREAMS))}"
 

@@ -48,6 +48,10 @@ class NeedsWhatIsNot(FakeCause):
     needs = frozenset({"comands"})
 
 
+class NeedsAText(FakeCause):
+    needs = "commands"
+
+
 class NeedsAModel(FakeCause):
     needs = frozenset({"model"})
 
@@ -122,6 +126,7 @@ WRONG = {
     TitleIsASentence: "says_what_it_is",
     RemedyWithoutAFullStop: "says_what_it_is",
     NeedsWhatIsNot: "says_what_it_is",
+    NeedsAText: "says_what_it_is",
     NeedsAModel: "is_tested_on_all_windows",
     SeesNothing: "is_accused_where_it_is_at_work",
     NumberOfNothing: "is_accused_where_it_is_at_work",
@@ -134,6 +139,14 @@ WRONG = {
     TakesTheLongForGranted: "takes_gaps_and_short_windows",
     TakesGapsForMotion: "takes_gaps_and_short_windows",
 }
+
+
+def test_needs_of_another_type_say_how_to_write_them():
+    class Suite(TestFake):
+        kind = NeedsAText
+
+    with pytest.raises(AssertionError, match="needs is 'commands': write it as frozenset"):
+        Suite().test_says_what_it_is()
 
 
 @pytest.mark.parametrize(("wrong", "caught_by"), WRONG.items(), ids=lambda v: getattr(v, "__name__", v))

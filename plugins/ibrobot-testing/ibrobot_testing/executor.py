@@ -247,6 +247,8 @@ class ExecutorSuite(Suite[Executor]):
         executor, ctx, start = self.active()
         executor.set_goal("one", self._goal(ctx, self.poses(ctx)[1]), measure(ctx, start))
         position = self._follow(executor, ctx, start, 5)[-1] - 0.01
+        ended = [each.state for each in drain(executor) if each.state is not GoalState.EXECUTING]
+        assert not ended, f"the goal has {ended[0]} within 5 ticks: override `poses`, with the second farther away"
         executor.cancel(tick(ctx, position))
         for _ in range(5):
             np.testing.assert_allclose(executor.update(tick(ctx, position)), position, atol=self.tolerance_rad)

@@ -238,5 +238,15 @@ def test_catches(wrong, caught_by, tmp_path):
     assert caught_by in failed_checks(Suite, tmp_path)
 
 
+def test_goal_that_ends_too_soon_to_cancel_says_what_to_override():
+    class Near(TestExecutor):
+        @override
+        def poses(self, ctx):
+            return [pose + np.full(len(ctx.joints), 0.001) for pose in super().poses(ctx)[:1]] * 2
+
+    with pytest.raises(AssertionError, match="the goal has succeeded within 5 ticks: override `poses`"):
+        Near().test_cancel_holds_the_measured_position()
+
+
 def test_every_check_catches_something():
     assert checks(ExecutorSuite) == set(WRONG.values())
