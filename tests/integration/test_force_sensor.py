@@ -1,4 +1,4 @@
-"""A force sensor in the contract: what the policy saw of it is what the bag of the run gives, bit by bit."""
+"""A force sensor in the contract: what the policy saw of it is what bag and dataset of the run have, bit by bit."""
 
 from __future__ import annotations
 
@@ -13,11 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import yaml
 from ibrobot_data.ticks import frames
 from ibrobot_netft.emulator import EmulatedNetFt
 from ibrobot_testing import ibrobot_command
+from independent import STORE, Sample, missing, samples
+from mcap.reader import make_reader
+from numpy.typing import NDArray
 from page_run import page_run
 
 from ibrobot_core.config import load_config
@@ -31,6 +35,9 @@ from ibrobot_core.plugins import installed_plugins
 
 pytestmark = pytest.mark.integration
 
+_RECORD_S = 0.04
+"""Time between two records of the sensor [s]: policy and dataset, at other moments 50 ms apart, share most of them."""
+
 
 @pytest.fixture
 def device() -> Iterator[EmulatedNetFt]:
@@ -39,7 +46,7 @@ def device() -> Iterator[EmulatedNetFt]:
 
     def measure() -> None:
         count = 0
-        while not ended.wait(0.005):
+        while not ended.wait(_RECORD_S):
             count += 1
             sensor.measure((0, 0, 1000 * count, -count, 0, 0))
 
@@ -90,7 +97,7 @@ def robot(folder: Path, device: EmulatedNetFt, policy: str = "fake", **observati
     return path
 
 
-def test_a_policy_sees_forces_as_the_bag_has_them(site: Any, tmp_path: Path, device: EmulatedNetFt) -> None:
+def test_a_policy_sees_forces_as_bag_and_dataset_have_them(site: Any, tmp_path: Path, device: EmulatedNetFt) -> None:
     site.add("force-keeper", "force_keeper.py")
     registry = installed_plugins()
     config = load_config(robot(tmp_path, device, "force_keeper"), sim=True)
@@ -123,7 +130,41 @@ def test_a_policy_sees_forces_as_the_bag_has_them(site: Any, tmp_path: Path, dev
     out = tmp_path / "dataset"
     line = ["convert", str(path), "--out", str(out), "--outcome", "unknown", "--jobs", "1"]
     subprocess.run([*ibrobot_command(), *line], check=True, capture_output=True, timeout=120)
-    assert "observation.force" in (out / "meta/info.json").read_text()
+    rows = pq.read_table(out / "data/chunk-000/file-000.parquet")["observation.force"].combine_chunks()
+    converted = rows.flatten().to_numpy().reshape(len(rows), -1)
+    records = recorded_forces(path)
+    topics = samples(path, spec)
+    times = [each.received_ns for of_topic in topics.values() for each in of_topic]
+    ticks = range(min(times), max(times) + 1, spec.step_ns)
+    whole = [t_ns for t_ns, absent in zip(ticks, missing(topics, spec), strict=True) if not absent]
+    seen = {in_effect(records, frame.stamp_ns): frame.values["observation.force"] for frame in kept}
+    stored = {in_effect(records, t_ns): row for t_ns, row in zip(whole, converted, strict=True)}
+    for values in (seen, stored):
+        for number, value in values.items():
+            assert (value.dtype, value.tobytes()) == (np.float32, records[number][1].tobytes())
+    both = seen.keys() & stored.keys()
+    assert len(both) > 5
+    assert [seen[number].tobytes() for number in both] == [stored[number].tobytes() for number in both]
+
+
+def recorded_forces(folder: Path) -> list[tuple[Sample, NDArray[np.float32]]]:
+    """What the bag has of the sensor, read without ibrobot."""
+    found = []
+    with (folder / f"{folder.name}_0.mcap").open("rb") as file:
+        for schema, _, message in make_reader(file).iter_messages(topics=["/force/wrist/wrench"]):
+            assert schema is not None
+            decoded: Any = STORE.deserialize_cdr(message.data, schema.name)
+            stamp, wrench = decoded.header.stamp, decoded.wrench
+            numbers = [getattr(part, axis) for part in (wrench.force, wrench.torque) for axis in ("x", "y", "z")]
+            sample = Sample(stamp.sec * 10**9 + stamp.nanosec, message.log_time)
+            found.append((sample, np.array(numbers, np.float32)))
+    return found
+
+
+def in_effect(records: list[tuple[Sample, NDArray[np.float32]]], t_ns: int) -> int:
+    """The number of the record that counts at a time [ns]: the newest by its stamp of those that have come."""
+    due = [n for n, (sample, _) in enumerate(records) if max(sample.stamp_ns, sample.received_ns) <= t_ns]
+    return max(due, key=lambda n: records[n][0].stamp_ns)
 
 
 @pytest.mark.parametrize(
