@@ -257,6 +257,7 @@ class ModelConfig(NamedComponentConfig):
     plugin_kind = "policy"
 
     norm_mode: str = option("radians", choices=NORM_MODES, help="unit of the joints in its vectors")
+    units: str | None = option(None, help="type of what converts them; needed if several plugins offer a default")
     calibration: str | None = option(None, help="for norm_mode, in place of the hardware's: a name or a path")
     extra_observations: tuple[ObservationSpec, ...] = option((), help="observations beyond the contract")
 

@@ -97,8 +97,9 @@ def _line(name: str, spec: PolicySpec) -> str:
 
 
 def _vectors(config: RobotConfig, model: ModelConfig, contract: Contract) -> PolicyVectors:
-    if model.norm_mode == "radians" and not any(part.features for part in contract.action_parts):
+    has_features = any(part.features for part in contract.action_parts)
+    if model.norm_mode == "radians" and model.units is None and not has_features:
         return PolicyVectors()
     registry, kind = installed_plugins(), "units"
-    made: PolicyVectors = registry.create(kind, registry.default(kind), config, model, contract)
+    made: PolicyVectors = registry.create(kind, model.units or registry.default(kind), config, model, contract)
     return made

@@ -16,7 +16,7 @@ from ibrobot_testing import ibrobot_command
 
 from ibrobot_core.app import installed_plugins
 
-LAST = ("units", "terminal")
+LAST = ("terminal",)
 """Kinds of which the only default is used: their packages cannot stand beside those of the repository."""
 
 

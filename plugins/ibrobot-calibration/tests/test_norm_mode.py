@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from calibration_files import write_calibration
+from fake_runs import PLUGINS
 from ibrobot_calibration import Calibration, JointCalibration
 from ibrobot_calibration.joint_units import radians_to_lerobot
 
@@ -61,3 +62,31 @@ def test_the_model_lives_in_degrees_and_the_arm_in_radians(
 def test_no_run_without_a_calibration(runs: Runs) -> None:
     with pytest.raises(ComponentFailed, match="degrees needs the calibration of joint 'pan'; there is none"):
         runs.start("models.net.norm_mode=degrees")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            ("norm_mode=degrees",),
+            r"name the type of the units: several .* a default: calibrated \(ibrobot-calibration\), other_units \(",
+        ),
+        (("norm_mode=degrees", "units=other_unit"), r"unknown units type 'other_unit'.*did you mean 'other_units'"),
+        (("norm_mode=degrees", "units=calibrated"), "degrees needs the calibration of joint 'pan'; there is none"),
+        (("units=other_units",), "norm_mode is radians, must be degrees"),
+    ],
+)
+def test_units_of_two_plugins_stand_beside_each_other_and_a_model_names_its_own(
+    runs: Runs, options: tuple[str, ...], message: str
+) -> None:
+    runs.site.add("other-units", PLUGINS / "other_units.py")
+    with pytest.raises(ComponentFailed, match=message):
+        runs.start(*(f"models.net.{each}" for each in options))
+
+
+def test_units_that_a_model_names_are_used(runs: Runs) -> None:
+    runs.site.add("other-units", PLUGINS / "other_units.py")
+    runtime = runs.start("models.net.norm_mode=degrees", "models.net.units=other_units")
+    for _ in range(24):
+        runtime.step()
+    assert runtime.session.faults == ()
