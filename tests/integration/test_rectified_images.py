@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +14,22 @@ import numpy as np
 import pytest
 import yaml
 from ibrobot_data.ticks import frames
+from ibrobot_diagnose.pictures import shrink
+from ibrobot_diagnose.references import read_episode
+from ibrobot_diagnose.rig import STILL_WIDTH
 from ibrobot_testing import ibrobot_command
 
 from ibrobot_core.config import find_config, load_config
 from ibrobot_core.contract.check import check_policy
 from ibrobot_core.contract.frames import FrameAssembler
+from ibrobot_core.contract.image import pixels
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.errors import ConfigError, ContractError
 from ibrobot_core.interfaces.policy import PolicySpec
 from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Session
+from ibrobot_core.messages import Image
 from ibrobot_core.plugins import Registry, installed_plugins
 
 pytestmark = pytest.mark.integration
@@ -86,29 +92,37 @@ def robot(folder: Path, calibration: dict[str, Any] | None = CALIBRATION, policy
     return path
 
 
-def test_a_policy_sees_what_the_conversion_gives(site: Any, tmp_path: Path) -> None:
+@pytest.fixture
+def recorded(site: Any, tmp_path: Path) -> Path:
+    """The bag of a run, whose frames are in `KEPT` of the policy."""
     site.add("picture-keeper", "picture_keeper.py")
-    registry = installed_plugins()
     config = load_config(robot(tmp_path, policy="picture_keeper", resize=[48, 64]), sim=True)
-    runtime = Runtime(Session(config, registry, LaunchRequest(lockstep=True, duration_s=1.5)))
+    runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, duration_s=1.5)))
     runtime.start()
     try:
         while not runtime.step():
             pass
     finally:
         runtime.stop()
-    kept = sys.modules["picture_keeper"].KEPT
-    assert len(kept) > 20
-
-    recorded = Contract.from_config(config).fingerprint()
+    fingerprint = Contract.from_config(config).fingerprint()
     (tmp_path / "lens.yaml").unlink()  # the recording has the intrinsics
     [path] = (tmp_path / "bags/default/episodes").iterdir()
-    reader = registry.open_episode(path)
-    spec = Contract.of_episode(reader.summary().metadata)
-    assert spec is not None
-    assert spec.fingerprint() == recorded
-    messages = [(each.topic, each.message, each.received_ns) for each in reader.messages(spec.topics)]
-    reader.close()
+    assert read(path)[0].fingerprint() == fingerprint
+    return path
+
+
+def read(episode: Path) -> tuple[Contract, list[tuple[str, Any, int]]]:
+    """The contract of an episode, and its messages: topic, message, and when it was received [ns]."""
+    with closing(installed_plugins().open_episode(episode)) as reader:
+        contract = Contract.of_episode(reader.summary().metadata)
+        assert contract is not None
+        return contract, [(each.topic, each.message, each.received_ns) for each in reader.messages(contract.topics)]
+
+
+def test_a_policy_sees_what_the_conversion_gives(recorded: Path) -> None:
+    kept = sys.modules["picture_keeper"].KEPT
+    assert len(kept) > 20
+    spec, messages = read(recorded)
     converted = list(frames(FrameAssembler(spec), messages, [frame.stamp_ns for frame in kept]))
     for live, later in zip(kept, converted, strict=True):
         assert live.values.keys() == later.values.keys()
@@ -123,11 +137,33 @@ def test_a_policy_sees_what_the_conversion_gives(site: Any, tmp_path: Path) -> N
     assert apart.max() > 50, "the pictures are rectified"
     assert "rectify" in spec.difference(distorted)
 
+
+def test_pictures_of_a_dataset_are_not_rectified_once_more(recorded: Path, tmp_path: Path) -> None:
+    """They would be on the way back to a bag, and where a model is asked again."""
     out = tmp_path / "dataset"
-    line = ["convert", str(path), "--out", str(out), "--outcome", "unknown", "--jobs", "1"]
+    line = ["convert", str(recorded), "--out", str(out), "--outcome", "unknown", "--jobs", "1"]
     subprocess.run([*ibrobot_command(), *line], check=True, capture_output=True, timeout=120)
     info = json.loads((out / "meta/info.json").read_text())
     assert info["features"][TOP]["shape"] == [48, 64, 3]
+
+    pinhole, messages = read(tmp_path / "dataset:0")
+    pictures = [message for _, message, _ in messages if isinstance(message, Image)]
+    assert len(pictures) > 20
+    again = frames(FrameAssembler(pinhole), messages, [each.header.stamp_ns for each in pictures])
+    for frame, picture in zip(again, pictures, strict=True):
+        np.testing.assert_array_equal(frame.values[TOP], picture.data.reshape(48, 64, 3))
+    check_policy(read(recorded)[0], PolicySpec({TOP: (48, 64, 3)}, None, 2, 1, contract=pinhole.canonical()))
+
+
+def test_explain_looks_at_what_the_policy_saw(recorded: Path) -> None:
+    """Datasets have such pictures, too. Where a camera is mounted is seen in its own."""
+    spec, messages = read(recorded)
+    raw = next(np.asarray(pixels(message), np.uint8) for _, message, _ in messages if isinstance(message, Image))
+    rectify = spec.parts(TOP)[0].rectifier
+    assert rectify is not None
+    camera = read_episode(recorded).cameras[TOP]
+    np.testing.assert_array_equal(camera.kept[0], shrink(rectify(raw)))
+    np.testing.assert_array_equal(next(iter(camera.stills.values())), shrink(raw, STILL_WIDTH))
 
 
 def test_a_policy_fits_any_lens_but_no_picture_that_is_not_rectified(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from ibrobot_core.api import (
     MODEL_ANSWERS,
     NS_PER_S,
     Contract,
+    ContractError,
     EpisodeReader,
     EpisodeSummary,
     Float64MultiArray,
@@ -348,7 +349,10 @@ def read_window(reader: EpisodeReader, name: str = "") -> Window:
     """
     summary = reader.summary()
     name = name or summary.path.name
-    return _Reading(_contract_of(summary), reader).window(name)
+    try:
+        return _Reading(_contract_of(summary), reader).window(name)
+    except ContractError as error:  # e.g. intrinsics of a camera with pictures of another size
+        raise RecorderError(f"{summary.path}: {error}") from error
 
 
 def _contract_of(summary: EpisodeSummary) -> Contract:
@@ -388,6 +392,7 @@ class _Reading:
         self._joints = contract.action_joints
         parts = contract.observation_parts
         self._pictures = {part.topic: Camera(part.key, part.topic) for part in parts if part.image is not None}
+        self._rectifiers = {part.topic: part.rectifier for part in parts}
         self._states: list[tuple[int, int, list[float]]] = []
         self._newest = dict.fromkeys(self._joints, float("nan"))
         self._command_topics: dict[str, list[Any]] = {}
@@ -477,10 +482,12 @@ class _Reading:
             return
         shown = _rgb(message)
         camera.size = shown.shape[:2]
-        index = len(camera.pictures)
-        camera.pictures.append(small_of(shown, digest))
         if not camera.stills or t_ns - max(camera.stills) >= self._still_every_ns:
             camera.stills[t_ns] = shrink(shown, STILL_WIDTH)
+        if (rectify := self._rectifiers[camera.topic]) is not None:  # as the policy and datasets have it
+            shown = rectify(shown)
+        index = len(camera.pictures)
+        camera.pictures.append(small_of(shown, digest))
         if not camera.kept or t_ns - camera.times_ns[max(camera.kept)] >= self._keep_every_ns:
             camera.kept[index] = shrink(shown)
 
