@@ -91,6 +91,25 @@ class GivesUp(Wrong):
         return [Done(done.job, None, ComponentFailed("its process was killed"))]
 
 
+class CountsTheDead(Wrong):
+    """What a job told before its last process died stays in the count."""
+
+    count = dead = 0
+
+    def watched(self, watch):
+        def told(count):
+            self.count = count
+            watch(count + self.dead)
+
+        self.told = told
+        return told
+
+    def after(self, done):
+        self.dead += done.error is not None
+        self.told(self.count)
+        return [done]
+
+
 class KeepsProcesses(Wrong):
     def before(self, jobs):
         return (Job(each.function, each.argument) for each in jobs)
@@ -122,6 +141,7 @@ WRONG = [
     (PlainErrors, "error_of_a_job_is_its_own"),
     (HidesErrors, "bug_in_a_job_is_an_error"),
     (HidesErrors, "job_that_kills_each_process_fails_and_others_do_not"),
+    (CountsTheDead, "job_that_kills_each_process_fails_and_others_do_not"),
     (GivesUp, "job_whose_process_is_killed_is_run_again"),
     (GoesOn, "closing_ends_the_jobs_that_run"),
     (KeepsProcesses, "own_processes_run_one_job_each_in_the_same_folder"),

@@ -93,6 +93,7 @@ class FakePool(Pool):
                     except EOFError:
                         task.end()
                         task.deaths += 1
+                        task.progress = 0
                         if task.deaths < self.tries:
                             task.begin()
                             continue
@@ -120,7 +121,6 @@ class _Task:
     def begin(self) -> None:
         """Start a process that does the job."""
         context = multiprocessing.get_context("spawn")
-        self.progress = 0
         self.pipe, theirs = context.Pipe(duplex=False)
         self._process = context.Process(target=_work, args=(self.job, theirs), daemon=True)
         with theirs:

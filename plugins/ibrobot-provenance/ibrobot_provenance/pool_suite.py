@@ -108,12 +108,15 @@ class PoolSuite(Suite[Pool]):
         assert counts[-1] == 3, "the progress of a process that died does not count"
 
     def test_job_that_kills_each_process_fails_and_others_do_not(self) -> None:
-        """A job with which several processes have died fails alone."""
+        """A job with which several processes have died fails alone, and its progress does not count."""
+        counts: list[int] = []
         with self.opened(2) as pool:
-            done = {each.job.argument.number: each for each in pool.run([Job(die_if_odd, Order(n)) for n in range(3)])}
+            ran = pool.run([Job(die_if_odd, Order(number)) for number in range(3)], counts.append)
+            done = {each.job.argument.number: each for each in ran}
         assert (done[0].result(), done[2].result()) == (0, 2)
         assert done[1].error is not None
         assert done[1].value is None
+        assert counts[-1] == 2, "the progress of a job with which processes died does not count"
 
     def test_own_processes_run_one_job_each_in_the_same_folder(self, tmp_path: Path, monkeypatch: Any) -> None:
         """A job with `own_process` gets a new process, in the folder of the caller."""

@@ -65,6 +65,7 @@ def die_once(order: Order, progress: Progress) -> int:
 
 def die_if_odd(order: Order, progress: Progress) -> int:
     """Kill the process each time if the number is odd."""
+    progress(1)
     if order.number % 2:
         os.kill(os.getpid(), signal.SIGKILL)
     return order.number
