@@ -8,7 +8,7 @@ dark, bright, blurred, covered, frozen, of other colours, turned or moved, camer
 two), positions in degrees, a joint's zero shifted by 20 degrees, and two joints with each other's place. The first line
 must name the fault, and nothing if there is none. Prints a table, what else was named first, and one JSON object.
 
-No recording of a real arm lies here: give one of your own, or one that others have published.
+No recording of a real arm comes with the repository: give one of your own, or a published one.
 """
 
 from __future__ import annotations
