@@ -207,3 +207,16 @@ def test_the_page_takes_a_plain_chessboard(tmp_path: Path, monkeypatch: pytest.M
 def test_a_board_that_makes_no_sense_is_named(changes: dict[str, str]) -> None:
     with pytest.raises(RequestError, match="give its squares as 10 x 7, and their side in mm"):
         calibrate.board_of({"squares": "10 x 7", "square": "25", **changes})
+
+
+@pytest.mark.parametrize("squares", ["8x6", " 8 X 6 ", "8 \u00d7 6", "8*6"])
+def test_squares_are_read_as_people_write_them(squares: str) -> None:
+    board = calibrate.board_of({"squares": squares, "square": "25"})
+    assert (board.columns, board.rows) == (8, 6)
+
+
+@pytest.mark.parametrize("squares", ["", "10", "10 x 7 x 3", "ten x 7", "9" * 5000 + " x 7"])
+def test_squares_that_are_no_pair_are_shown_as_they_were_typed(squares: str) -> None:
+    with pytest.raises(RequestError) as refused:
+        calibrate.board_of({"squares": squares, "square": "25"})
+    assert str(refused.value).startswith(f"the board: its squares are {squares[:40]!r}; give its squares as 10 x 7")

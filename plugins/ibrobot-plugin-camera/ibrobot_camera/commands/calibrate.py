@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,6 +25,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
 _HINT_S = 2.0
 """Least time between two hints [s]."""
 _BOARD = Path("board.pdf")
+_SQUARES = re.compile(r"\s*(\d{1,3})\s*[xX\u00d7*]\s*(\d{1,3})\s*")
 
 type Read = Callable[[float], NDArray[np.uint8] | None]
 """Waits for a picture up to a time [s]; grey or BGR."""
@@ -162,9 +164,12 @@ def board_of(answers: Mapping[str, str | bool]) -> Board:
     Raises:
         RequestError: if they make no sense.
     """
+    typed = str(answers["squares"])
+    squares = _SQUARES.fullmatch(typed)
     try:
-        columns, rows = (int(each) for each in str(answers["squares"]).lower().split("x"))
-        return Board(columns=columns, rows=rows, square=float(answers["square"]))
+        if squares is None:
+            raise ValueError(f"its squares are {typed[:40]!r}")
+        return Board(columns=int(squares[1]), rows=int(squares[2]), square=float(answers["square"]))
     except ValueError as error:
         raise RequestError(f"the board: {error}; give its squares as 10 x 7, and their side in mm") from None
 
