@@ -49,7 +49,7 @@ class NeedsWhatIsNot(FakeCause):
 
 
 class NeedsAText(FakeCause):
-    needs = "commands"
+    needs = "commands"  # type: ignore[assignment]
 
 
 class NeedsAModel(FakeCause):
