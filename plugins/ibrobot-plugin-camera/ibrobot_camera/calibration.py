@@ -24,7 +24,7 @@ def load_info(path: Path) -> Callable[[Header], CameraInfo]:
     """
     try:
         document = yaml.safe_load(path.read_text())
-    except (OSError, yaml.YAMLError) as error:
+    except (OSError, UnicodeDecodeError, RecursionError, yaml.YAMLError) as error:
         raise SensorError(f"{path}: cannot be read: {error}") from None
     if not isinstance(document, dict):
         raise SensorError(f"{path}: must be a mapping, as camera_calibration writes it")
@@ -41,7 +41,7 @@ def _numbers(document: dict[str, Any], key: str, count: int | None, where: str) 
     entry = document.get(key)
     try:
         numbers = np.array(entry["data"], dtype=np.float64)  # type: ignore[index]
-    except (TypeError, KeyError, ValueError):
+    except (TypeError, KeyError, ValueError, OverflowError):
         raise SensorError(f"{where}: {key}: must have `data`, a list of numbers, not {entry!r}") from None
     if numbers.ndim != 1 or (count is not None and numbers.size != count):
         raise SensorError(f"{where}: {key}: must have {count} numbers, not {numbers.size}")

@@ -189,3 +189,21 @@ def test_a_camera_has_the_intrinsics_of_its_file(tmp_path: Path) -> None:
 def test_a_camera_without_a_file_says_what_is_missing() -> None:
     with pytest.raises(SensorError, match=r"`info` of the camera: a calibration file, as `ibrobot camera calibrate`"):
         _ = OpenCvOptions(device=0).lens
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"\xff\xfe", "cannot be read"),
+        (b"[" * 100_000, "cannot be read"),
+        (
+            b"image_width: 2\nimage_height: 2\ndistortion_coefficients: {data: [1" + b"0" * 400 + b"]}",
+            "must have `data`",
+        ),
+    ],
+    ids=["no text", "deep", "beyond all numbers"],
+)
+def test_a_damaged_calibration_file_is_named(tmp_path: Path, content: bytes, message: str) -> None:
+    (tmp_path / "top.yaml").write_bytes(content)
+    with pytest.raises(SensorError, match=rf"top\.yaml: .*{message}"):
+        load_info(tmp_path / "top.yaml")
