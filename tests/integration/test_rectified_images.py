@@ -138,21 +138,29 @@ def test_a_policy_sees_what_the_conversion_gives(recorded: Path) -> None:
     assert "rectify" in spec.difference(distorted)
 
 
+def convert(*line: str | Path) -> None:
+    command = [*ibrobot_command(), "convert", *map(str, line)]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+
+
 def test_pictures_of_a_dataset_are_not_rectified_once_more(recorded: Path, tmp_path: Path) -> None:
     """They would be on the way back to a bag, and where a model is asked again."""
     out = tmp_path / "dataset"
-    line = ["convert", str(recorded), "--out", str(out), "--outcome", "unknown", "--jobs", "1"]
-    subprocess.run([*ibrobot_command(), *line], check=True, capture_output=True, timeout=120)
+    convert(recorded, "--out", out, "--outcome", "unknown", "--jobs", "1")
     info = json.loads((out / "meta/info.json").read_text())
     assert info["features"][TOP]["shape"] == [48, 64, 3]
 
-    pinhole, messages = read(tmp_path / "dataset:0")
-    pictures = [message for _, message, _ in messages if isinstance(message, Image)]
-    assert len(pictures) > 20
-    again = frames(FrameAssembler(pinhole), messages, [each.header.stamp_ns for each in pictures])
-    for frame, picture in zip(again, pictures, strict=True):
-        np.testing.assert_array_equal(frame.values[TOP], picture.data.reshape(48, 64, 3))
-    check_policy(read(recorded)[0], PolicySpec({TOP: (48, 64, 3)}, None, 2, 1, contract=pinhole.canonical()))
+    robot(tmp_path, resize=[48, 64])
+    convert(out, "--to", "bag", "--out", tmp_path / "again", "--config", tmp_path / "tryout.yaml")
+    (bag,) = (tmp_path / "again/episodes").iterdir()
+    for episode in (tmp_path / "dataset:0", bag):
+        pinhole, messages = read(episode)
+        pictures = [message for _, message, _ in messages if isinstance(message, Image)]
+        assert len(pictures) > 20
+        again = frames(FrameAssembler(pinhole), messages, [each.header.stamp_ns for each in pictures])
+        for frame, picture in zip(again, pictures, strict=True):
+            np.testing.assert_array_equal(frame.values[TOP], picture.data.reshape(48, 64, 3))
+        check_policy(read(recorded)[0], PolicySpec({TOP: (48, 64, 3)}, None, 2, 1, contract=pinhole.canonical()))
 
 
 def test_explain_looks_at_what_the_policy_saw(recorded: Path) -> None:

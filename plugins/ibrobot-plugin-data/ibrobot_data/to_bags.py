@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_provenance.datasets import with_pinholes
 from ibrobot_provenance.ownership import Ownership
 
 import ibrobot_core
@@ -151,7 +152,8 @@ class _Job:
 
     def _check(self, summary: EpisodeSummary) -> Contract:
         contract = Contract.from_canonical(json.loads(summary.metadata["contract"]))
-        asked = self._request.contract.without_signals() if self._request.contract is not None else contract
+        given = self._request.contract
+        asked = with_pinholes(given.without_signals()) if given is not None else contract
         if asked.fingerprint() != contract.fingerprint():
             difference = asked.difference(contract, names=("--config", "dataset"))
             raise ContractError(f"{self._path}: was made with another contract than that of --config:\n{difference}")

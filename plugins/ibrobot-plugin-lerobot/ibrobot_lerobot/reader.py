@@ -14,6 +14,7 @@ from typing import Any, override
 import attrs
 import numpy as np
 from ibrobot_calibration.joint_units import JointUnits
+from ibrobot_provenance.datasets import with_pinholes
 from ibrobot_provenance.robot_metadata import robot_metadata
 from numpy.typing import NDArray
 
@@ -27,7 +28,6 @@ from ibrobot_core.api import (
     EpisodeReader,
     EpisodeSummary,
     Feature,
-    ObservationPart,
     Recorded,
     RecorderError,
     TopicSummary,
@@ -206,7 +206,7 @@ def episode_origin(root: Path, metadata: Mapping[str, Any], number: int, given: 
         episode = metadata["episodes"][number]
         calibration = metadata["calibrations"][episode["calibration"]] if episode["calibration"] else {}
         document = metadata["configs"][episode["config"]] if episode.get("config") else {}
-        contract = _with_pinholes(Contract.from_canonical(metadata["contract"]).without_signals())
+        contract = with_pinholes(Contract.from_canonical(metadata["contract"]).without_signals())
         recorded = dict(episode.get("recorded", {}))
         norm_mode = metadata["conversion"]["norm_mode"]
         own = {"prompt": episode["prompt"], "source": f"{root.resolve().name}:{number}"}
@@ -215,22 +215,6 @@ def episode_origin(root: Path, metadata: Mapping[str, Any], number: int, given: 
         raise RecorderError(f"{root}: the metadata of episode {number} cannot be read: {error!r}") from None
     recorded |= own | robot_metadata(contract, document, {"converted": calibration} if calibration else {})
     return Origin(recorded, contract, document, calibration, norm_mode, outcome, start_ns)
-
-
-def _with_pinholes(contract: Contract) -> Contract:
-    """The contract of a dataset's pictures: where the conversion has removed a lens's distortion, there is none."""
-    return attrs.evolve(contract, observation_parts=tuple(map(_with_pinhole, contract.observation_parts)))
-
-
-def _with_pinhole(part: ObservationPart) -> ObservationPart:
-    """A camera without distortion, which changes no picture, whatever its focal length."""
-    if "rectify" not in part.model:
-        return part
-    height, width, _ = part.feature.shape
-    size = {"width": width, "height": height} if min(width, height) > 0 else {}
-    k, p = np.eye(3).ravel().tolist(), np.eye(3, 4).ravel().tolist()
-    lens = {**part.model["rectify"], **size, "distortion_model": "plumb_bob", "d": [], "k": k, "r": k, "p": p}
-    return attrs.evolve(part, model={"rectify": lens})
 
 
 def _origin_as_given(root: Path, given: Mapping[str, str]) -> Origin:
@@ -244,7 +228,7 @@ def _origin_as_given(root: Path, given: Mapping[str, str]) -> Origin:
             f"{root}: was not made by ibrobot, so it does not state the unit of its joints; "
             "give it: radians, degrees or range_m100_100"
         )
-    contract = Contract.from_canonical(json.loads(given["contract"]))
+    contract = with_pinholes(Contract.from_canonical(json.loads(given["contract"])))
     calibrations = json.loads(given.get("calibration", "{}"))
     document = json.loads(given.get("config", "{}"))
     joined = {joint: numbers for each in calibrations.values() for joint, numbers in each.items()}

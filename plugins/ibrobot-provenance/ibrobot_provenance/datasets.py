@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from ibrobot_core.api import Feature
+    from ibrobot_core.api import Contract, Feature, ObservationPart
 
 
 @attrs.frozen
@@ -119,3 +119,20 @@ def element_names(names: Any) -> tuple[str, ...]:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         return ()
     return tuple(names)
+
+
+def with_pinholes(contract: Contract) -> Contract:
+    """The contract of a dataset's pictures: where the conversion has removed a lens's distortion, there is none."""
+    return attrs.evolve(contract, observation_parts=tuple(map(_with_pinhole, contract.observation_parts)))
+
+
+def _with_pinhole(part: ObservationPart) -> ObservationPart:
+    """A camera without distortion, which changes no picture, whatever its focal length."""
+    if "rectify" not in part.model:
+        return part
+    height, width, _ = part.feature.shape
+    size = {"width": width, "height": height} if min(width, height) > 0 else {}
+    k = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+    p = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+    lens = {**part.model["rectify"], **size, "distortion_model": "plumb_bob", "d": [], "k": k, "r": k, "p": p}
+    return attrs.evolve(part, model={"rectify": lens})
