@@ -312,6 +312,6 @@ def test_a_base_that_is_attacked_touches_nothing(monkeypatch, attack) -> None:
     drive, judge = start(monkeypatch, boxes)
     count = sum(1 for _ in attack(drive, np.random.default_rng(47)))
     assert count >= 15
-    assert judge.driven > 0.5, "it has not been held all the time"
+    assert judge.driven > 0.3, "it has been held nearly all the time"
     assert judge.nearest > MARGIN_M - _OFF_M
     drive.close()

@@ -231,7 +231,7 @@ class TestFullDisk:
         disk = mounted("size=400k")
         done = run("convert", dataset, "--to", "bag", "--out", disk / "back", "--set", "min_free=0")
         assert done.code == 1
-        assert f"stopped at set:0: {disk}/back" in done.err
+        assert f"stopped at set:0: {FULL}" in done.err
         assert f"0 of 2 episodes are converted and kept in {disk}/back: make room, and run the same command" in done.err
         assert done.err.count(FULL) == 1
         assert list(disk.rglob("*.mcap")) == []
