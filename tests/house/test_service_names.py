@@ -9,6 +9,8 @@ from difflib import get_close_matches
 from pathlib import Path
 
 import pytest
+
+pytest.importorskip("ibrobot_ros2")
 from plain_requests import declared
 
 ROOT = Path(__file__).parents[2]

@@ -60,12 +60,6 @@ def chunk_file(folder: str, number: int, suffix: str) -> str:
     return f"{folder}/chunk-{chunk:03d}/file-{file:03d}.{suffix}"
 
 
-def file_number(row: Mapping[str, Any], what: str) -> int:
-    """Number of the file, counted from 0, that an episode's row names for `what`, e.g. `data`."""
-    number: int = row[f"{what}/chunk_index"] * FILES_PER_CHUNK + row[f"{what}/file_index"]
-    return number
-
-
 @attrs.frozen
 class Column:
     """A feature and how it is stored."""
@@ -144,6 +138,13 @@ def table_schema(stored: Mapping[str, Column]) -> pa.Schema:
     described = {column.key: column.hugging_face for column in kept}
     described |= {key: {"dtype": dtype, "_type": "Value"} for key, dtype in COUNTERS.items()}
     return pa.schema(fields, {"huggingface": json.dumps({"info": {"features": described}})})
+
+
+def most_mib(info: Mapping[str, Any], kind: str) -> float:
+    """Size at which a new file of a kind, `data` or `video`, begins [MiB]; LeRobot's default if `info` lacks it."""
+    defaults = LeRobotOptions()
+    default = defaults.table_file_mb if kind == "data" else defaults.video_file_mb
+    return float(info.get(f"{kind}_files_size_in_mb", default))
 
 
 def new_info(stored: Mapping[str, Column], fps: float, robot_type: str, table_mb: int, video_mb: int) -> dict[str, Any]:
@@ -256,12 +257,26 @@ class OnDisk:
 
     def table(self, row: Mapping[str, Any]) -> Path:
         """The file with the rows of an episode."""
-        return self.root / chunk_file(DATA, file_number(row, "data"), "parquet")
+        return self.root / chunk_file(DATA, self._file(row, "data"), "parquet")
 
     def video(self, row: Mapping[str, Any], key: str) -> Path:
         """The file with a camera's pictures of an episode."""
         folder = f"{VIDEOS}/{key}"
-        return self.root / chunk_file(folder, file_number(row, folder), "mp4")
+        return self.root / chunk_file(folder, self._file(row, folder), "mp4")
+
+    def _file(self, row: Mapping[str, Any], what: str) -> int:
+        """Number of the file, counted from 0, that an episode's row names for `what`, e.g. `data`.
+
+        Raises:
+            DatasetError: if it names none.
+        """
+        chunk, file = row.get(f"{what}/chunk_index"), row.get(f"{what}/file_index")
+        if chunk is None or file is None:
+            raise DatasetError(
+                f"{self.root}: meta/episodes: episode {row.get('episode_index')}: {what}/chunk_index and"
+                f" {what}/file_index are {chunk} and {file}: whole numbers from 0 on name its file"
+            )
+        return int(chunk * FILES_PER_CHUNK + file)
 
 
 class OlderOnDisk(OnDisk):

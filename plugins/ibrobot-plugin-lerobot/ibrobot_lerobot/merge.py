@@ -278,7 +278,7 @@ class _Merge:
     def _append_table(self, path: Path, tasks: np.ndarray[Any, Any]) -> int:
         """Append a part's table, renumbered; returns the number of the file to which it was added."""
         size = path.stat().st_size
-        limit = self._info["data_files_size_in_mb"] * _MIB
+        limit = layout.most_mib(self._info, "data") * _MIB
         if self._table is not None and self._data.bytes + size > limit:
             self._table.close()
             self._table, self._data = None, _Place(self._data.number + 1)
@@ -322,7 +322,7 @@ class _Merge:
 
     def _append_videos(self, part: OnDisk, key: str, rows: list[dict[str, Any]]) -> dict[Path, tuple[int, float]]:
         """Schedule a part's videos of a camera for joining; returns file number and start time [s] of each."""
-        limit = self._info["video_files_size_in_mb"] * _MIB
+        limit = layout.most_mib(self._info, "video") * _MIB
         frames: dict[Path, int] = {}
         for row in rows:
             path = part.video(row, key)

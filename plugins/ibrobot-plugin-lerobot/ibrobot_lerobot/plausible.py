@@ -86,6 +86,8 @@ def _check_feature(path: Path, key: str, entry: Any) -> None:
     if not isinstance(more, dict):
         raise DatasetError(f"{where}: info: {_shown(more)} is not an object")
     if dtype not in ("image", "video"):
+        if len(shape) == 3 and dtype not in np.sctypeDict:
+            raise DatasetError(f"{where}: dtype: {_shown(dtype)} is neither image, video nor the type of a number")
         return
     if len(shape) != 3 or not all(1 <= size < _LONGEST_SIDE for size in shape):
         raise DatasetError(f"{where}: shape: {_shown(shape)} is none of a picture")
