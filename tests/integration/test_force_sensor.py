@@ -98,7 +98,7 @@ def robot(folder: Path, device: EmulatedNetFt, policy: str = "fake", **observati
 
 
 def test_a_policy_sees_forces_as_bag_and_dataset_have_them(site: Any, tmp_path: Path, device: EmulatedNetFt) -> None:
-    site.add("force-keeper", "force_keeper.py")
+    site.add("frame-keeper", "frame_keeper.py")
     registry = installed_plugins()
     config = load_config(robot(tmp_path, device, "force_keeper"), sim=True)
     runtime = Runtime(Session(config, registry, LaunchRequest(duration_s=2.0)))
@@ -108,7 +108,7 @@ def test_a_policy_sees_forces_as_bag_and_dataset_have_them(site: Any, tmp_path: 
             pass
     finally:
         runtime.stop()
-    kept = sys.modules["force_keeper"].KEPT
+    kept = sys.modules["frame_keeper"].KEPT
     assert len(kept) > 10
     forces = np.array([frame.values["observation.force"][2] for frame in kept])
     assert (np.diff(forces) >= 0).all()

@@ -95,7 +95,7 @@ def robot(folder: Path, calibration: dict[str, Any] | None = CALIBRATION, policy
 @pytest.fixture
 def recorded(site: Any, tmp_path: Path) -> Path:
     """The bag of a run, whose frames are in `KEPT` of the policy."""
-    site.add("picture-keeper", "picture_keeper.py")
+    site.add("frame-keeper", "frame_keeper.py")
     config = load_config(robot(tmp_path, policy="picture_keeper", resize=[48, 64]), sim=True)
     runtime = Runtime(Session(config, installed_plugins(), LaunchRequest(lockstep=True, duration_s=1.5)))
     runtime.start()
@@ -120,7 +120,7 @@ def read(episode: Path) -> tuple[Contract, list[tuple[str, Any, int]]]:
 
 
 def test_a_policy_sees_what_the_conversion_gives(recorded: Path) -> None:
-    kept = sys.modules["picture_keeper"].KEPT
+    kept = sys.modules["frame_keeper"].KEPT
     assert len(kept) > 20
     spec, messages = read(recorded)
     converted = list(frames(FrameAssembler(spec), messages, [frame.stamp_ns for frame in kept]))
