@@ -49,6 +49,17 @@ def chromium() -> Iterator[Any]:
         browser.close()
 
 
+ALPHAS = """(() => {
+    const view = document.querySelector('#view canvas'), copy = document.createElement('canvas');
+    Object.assign(copy, { width: view.width, height: view.height });
+    const context = copy.getContext('2d');
+    context.drawImage(view, 0, 0);
+    const alphas = context.getImageData(0, 0, copy.width, copy.height).data.filter((_, i) => i % 4 === 3);
+    return [Math.min(...new Set(alphas)), Math.max(...new Set(alphas))];
+})()"""
+"""The least and the greatest opacity of what is drawn of the robot."""
+
+
 class Tab:
     """A page in a browser of its own; its errors are collected."""
 
@@ -137,6 +148,7 @@ def test_the_page_shows_the_robot_and_asks_no_other_host(tab: Tab, address: str)
     tab.until(lambda: tab.ask("ibrobot.view.frames") > 2)
     assert tab.text("#robot") == "so101"
     assert tab.ask("document.querySelector('#view .note').textContent") == "", "3D has a problem"
+    assert tab.ask(ALPHAS) == [0, 255], "the theme's background shows around the robot, before anything is drawn again"
     assert tab.page.locator(".joint").count() == 6
     assert tab.page.locator(".joint output").first.inner_text().endswith(" rad"), "as the panel in the terminal"
     tab.page.get_by_role("button", name="in radians").click()

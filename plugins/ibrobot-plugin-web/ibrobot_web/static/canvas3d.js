@@ -36,7 +36,7 @@ function isSoftware() {
 export class Canvas3D {
   constructor(canvas) {
     this.slow = isSoftware();
-    const gl = canvas.getContext("webgl2", { alpha: false, antialias: !this.slow, powerPreference: "high-performance" });
+    const gl = canvas.getContext("webgl2", { antialias: !this.slow, powerPreference: "high-performance" });
     if (!gl) throw new Error("this browser offers no WebGL 2 here");
     this.gl = gl;
     this.canvas = canvas;
@@ -53,7 +53,9 @@ export class Canvas3D {
     this.at = Object.fromEntries(["view", "projection", "model", "color", "lit"].map(
       (name) => [name, gl.getUniformLocation(program, name)]));
     gl.enable(gl.DEPTH_TEST);
-    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+    // Where nothing is drawn, the page's own background shows: a change of theme need not wait for a drawing.
+    gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.clearColor(0, 0, 0, 0);
   }
 
   // Triangles, {vertices, faces}, as something to draw.
@@ -92,10 +94,9 @@ export class Canvas3D {
   }
 
   // Items: {shape, matrix, color (rgba), lit, above (drawn over everything)}.
-  draw(items, view, projection, back) {
+  draw(items, view, projection) {
     const { gl, at } = this;
     gl.viewport(0, 0, this.canvas.width, this.canvas.height);
-    gl.clearColor(...back, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.useProgram(this.program);
     gl.uniformMatrix4fv(at.view, false, view);

@@ -1,8 +1,10 @@
-// Elements: h("button", {class: "primary", onclick: f}, "Text", child) makes one. Text is never markup.
+// Elements: h("button", {class: "primary", onclick: f}, "Text", child) makes one. Text is never markup, but for what
+// stands between backticks: that is code.
 
 import { words } from "./words.js";
 
 const READ = ["aria-label", "placeholder", "title", "label"]; // properties that people read
+const VERBATIM = ["code", "option", "pre", "textarea"]; // elements whose text is shown as it is
 
 export function h(tag, properties = {}, ...children) {
   const element = document.createElement(tag);
@@ -12,14 +14,26 @@ export function h(tag, properties = {}, ...children) {
     else if (value === true) element.setAttribute(name, "");
     else element.setAttribute(name, READ.includes(name) ? words(value) : value);
   }
-  element.append(...children.flat().filter((child) => child !== null && child !== undefined).map(words));
+  const shown = children.flat().filter((child) => child !== null && child !== undefined).map(words);
+  element.append(...(VERBATIM.includes(tag) ? shown : shown.flatMap(marked)));
   return element;
+}
+
+// A text as texts and elements: what stands between backticks, in one line, is code. Anything else stays as it is.
+function marked(text) {
+  if (typeof text !== "string") return [text];
+  return text.split(/`([^`\n]+)`/).map((part, i) => {
+    if (i % 2 === 0) return part;
+    const code = document.createElement("code"); // not by `h`, which would translate a command that is also a word
+    code.textContent = part;
+    return code;
+  }).filter((part) => part !== "");
 }
 
 // Sets text only if it changed, so that screen readers and the layout rest.
 export function say(element, text) {
-  const shown = words(text);
-  if (element.textContent !== shown) element.textContent = shown;
+  const shown = h(element.localName, {}, text);
+  if (element.innerHTML !== shown.innerHTML) element.replaceChildren(...shown.childNodes);
 }
 
 // Replaces an element's children only if the described content changed.
@@ -38,7 +52,7 @@ const nameOf = (control) => `${control.localName} ${control.getAttribute("aria-l
 export function replace(element, ...children) {
   const before = document.activeElement;
   const name = before !== element && element.contains(before) ? nameOf(before) : null;
-  element.replaceChildren(...children.flat().map(words));
+  element.replaceChildren(...children.flat().map(words).flatMap(marked));
   if (name === null) return;
   const same = [...element.querySelectorAll(CONTROLS)].find((each) => nameOf(each) === name && !each.disabled);
   if (!same && !element.hasAttribute("tabindex")) element.tabIndex = -1;
@@ -97,7 +111,7 @@ export function confirm(title, text, yes, { danger = true, no = "Cancel" } = {})
   return new Promise((resolve) => dialog.addEventListener("close", () => resolve(dialog.returnValue === "yes"), { once: true }));
 }
 
-export function isDark() {
+function isDark() {
   const { theme } = document.documentElement.dataset;
   return theme ? theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
 }
@@ -119,7 +133,7 @@ export function toast(text, kind = "info") {
   announced ??= (document.getElementById("stage") ?? document.body).appendChild(h("div", { class: "toasts", role: "status", "aria-live": "polite" }));
   const item = h("div", { class: `toast ${kind}` }, h("p", {}, text),
     h("button", { "aria-label": "Close", onclick: () => item.remove() }, "×"));
-  const others = [...announced.children].filter((each) => each.firstChild.textContent !== words(text));
+  const others = [...announced.children].filter((each) => each.firstChild.textContent !== item.firstChild.textContent);
   announced.replaceChildren(...others.slice(-2), item);
   const leave = () => { if (item.matches(":hover, :focus-within")) setTimeout(leave, 1000); else item.remove(); };
   setTimeout(leave, SHOWN_MS[kind]);

@@ -1,7 +1,7 @@
 // The 3D view: the main thread's side. Drawing happens in a worker, so that a slow graphics card delays neither the
 // deadman nor the stop.
 
-import { h, isDark, say } from "./dom.js";
+import { h, say } from "./dom.js";
 
 const STEP = 0.1;
 
@@ -27,7 +27,7 @@ export class View3D {
     }
     this.worker = new Worker("/static/view3d.worker.js", { type: "module" });
     const offscreen = this.canvas.transferControlToOffscreen();
-    this.worker.postMessage({ do: "start", canvas: offscreen, dark: isDark() }, [offscreen]);
+    this.worker.postMessage({ do: "start", canvas: offscreen }, [offscreen]);
     this.worker.onerror = (event) => { say(this.note, `3D failed: ${event.message}`); };
     this.worker.onmessage = ({ data }) => {
       if (data.slides) this.slides = data.slides;
@@ -43,8 +43,6 @@ export class View3D {
     new ResizeObserver(() => this.resize()).observe(this.canvas);
     this.resize();
     this.listen();
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.theme());
-    new MutationObserver(() => this.theme()).observe(document.documentElement, { attributeFilter: ["data-theme"] });
     if (scene) this.load(scene);
   }
 
@@ -73,8 +71,6 @@ export class View3D {
     const { width, height } = this.canvas.getBoundingClientRect();
     this.tell({ do: "size", width, height, ratio: Math.min(window.devicePixelRatio, 2) });
   }
-
-  theme() { this.tell({ do: "theme", dark: isDark() }); }
 
   listen() {
     const pointers = new Map();

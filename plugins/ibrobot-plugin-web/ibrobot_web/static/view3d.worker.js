@@ -14,11 +14,12 @@ const WIDE = 1.3; // width by height of a picture below which it counts as narro
 const FRUSTUM_M = 0.05;
 const NEAR = [0.93, 0.33, 0.2, 1]; // what the guard keeps apart
 const OBJECT = [0.55, 0.6, 0.66, 0.75];
+const GRID = [0.47, 0.54, 0.6, 0.5]; // on a light and on a dark page
 const FRAME_MS = 40; // 25 frames a second leave a small machine time for the rest
 const SLOW_FRAME_MS = 100; // without a graphics card, each costs processor time that control may need
 const COMMANDED = [0.18, 0.5, 0.83, 0.3], PLANNED = [0.12, 0.62, 0.33, 0.3];
 
-let screen, bodies = [], joints = [], tips = {}, tip = null, extras = [], dark = false;
+let screen, bodies = [], joints = [], tips = {}, tip = null, extras = [];
 let measured = null, commanded = null, planned = null;
 let trail = [], path, future, grid, ball;
 let dirty = true, stamp = 0, drawn = 0, size = [1, 1], jogs = false, view = null;
@@ -30,7 +31,7 @@ let goals = false, goal = null, kept = false, begun = 0;
 const orbit = { azimuth: -0.9, elevation: 0.45, distance: 1, target: [0.1, 0, 0.15] };
 const grip = { mode: null, at: [0, 0], through: [0, 0, 0], target: [0, 0, 0] };
 
-function start({ canvas, dark: isDark }) {
+function start({ canvas }) {
   try {
     screen = new Canvas3D(canvas);
   } catch (error) {
@@ -43,7 +44,6 @@ function start({ canvas, dark: isDark }) {
   const lines = [];
   for (let i = -10; i <= 10; i += 1) lines.push(i / 10, -1, 0, i / 10, 1, 0, -1, i / 10, 0, 1, i / 10, 0);
   grid = screen.line(lines, true);
-  dark = isDark;
   requestAnimationFrame(draw);
 }
 
@@ -161,10 +161,9 @@ function draw(now = 0) {
   begun = now;
   dirty = false;
   look();
-  const gray = dark ? [0.3, 0.37, 0.43, 1] : [0.68, 0.73, 0.77, 1];
   // A transparent object stays transparent, since it may hide the arm.
   const things = extras.map((each) => (near.includes(each.name) ? { ...each, color: [...NEAR.slice(0, 3), each.color[3] ?? 1] } : each));
-  const shown = [{ shape: grid, matrix: identity(), color: gray }, ...things];
+  const shown = [{ shape: grid, matrix: identity(), color: GRID }, ...things];
   if (measured) shown.push(...items(measured), { shape: path, matrix: identity(), color: [0.08, 0.47, 0.78, 1] });
   if (measured) {
     shown.push(...cameras.map(({ body, local, shape }) => (
@@ -175,7 +174,7 @@ function draw(now = 0) {
   if ((jogs || goals) && measured && tip) {
     shown.push({ shape: ball, matrix: shifted((goals && goal) || tipOf(measured)), color: [0.9, 0.45, 0.1, 0.85], lit: true, above: true });
   }
-  screen.draw(shown, view.matrix, view.projection, dark ? [0.08, 0.1, 0.13] : [0.93, 0.945, 0.957]);
+  screen.draw(shown, view.matrix, view.projection);
   const here = measured && tip ? seen((goals && goal) || tipOf(measured)) : null;
   if (stamp !== drawn) postMessage({ drawn: stamp, handle: here });
   drawn = stamp;
@@ -274,7 +273,6 @@ function resize({ width, height, ratio }) {
 
 const actions = {
   start, scene: load, state, plan, objects, size: resize, down, move, pinch, up: release,
-  theme: (message) => { dark = message.dark; dirty = true; },
   turn: ({ by }) => turn(by), zoom: ({ factor }) => zoom(factor),
   near: ({ names }) => { near = names; dirty = true; },
   joints: ({ names }) => { joints = names; },

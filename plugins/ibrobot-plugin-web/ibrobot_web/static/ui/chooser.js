@@ -1,6 +1,6 @@
 // The choice of a robot, its body and its mode, with what `ibrobot config check` says. Views share the choice.
 
-import { h, refresh, row, table } from "../dom.js";
+import { h, refresh, row, say, table } from "../dom.js";
 import { words } from "../words.js";
 
 const SOURCES = { folder: "In the opened folders", ibrobot: "Shipped with ibrobot", plugin: "Shipped with plugins" };
@@ -68,7 +68,7 @@ export class Chooser {
     const asked = ++this.asked;
     this.robot.value = choice.robot;
     for (const radio of this.body.querySelectorAll("input")) radio.checked = radio.dataset.sim === String(choice.sim);
-    this.summary.textContent = words(this.robots?.find(({ robot }) => robot === choice.robot)?.summary ?? "");
+    say(this.summary, this.robots?.find(({ robot }) => robot === choice.robot)?.summary ?? "");
     if (!choice.robot) return;
     let found;
     try {
@@ -99,7 +99,7 @@ function reportOf(found) {
     const count = found.problems.length;
     return [h("h3", {}, `${count} problem${count === 1 ? "" : "s"} in this YAML`),
       ...found.problems.map(({ file, line, path, message }) => h("div", { class: "problem" },
-        h("code", {}, `${file}${line ? `:${line}` : ""}: ${path ? `${path}: ` : ""}`), message))];
+        h("code", { class: "where" }, `${file}${line ? `:${line}` : ""}: ${path ? `${path}: ` : ""}`), message))];
   }
   const rows = [["Joints", found.joints.join(", ")], ["Cameras", found.cameras.join(", ") || "none"],
     ...Object.entries(found.devices)];

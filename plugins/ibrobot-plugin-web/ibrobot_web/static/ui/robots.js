@@ -1,11 +1,10 @@
 // View: choose a robot, see its problems, launch it, and stop it.
 
-import { h } from "../dom.js";
+import { h, say } from "../dom.js";
 import { Chooser } from "./chooser.js";
 import { Copy } from "./copy.js";
 import { JobList, RUNS } from "./job.js";
 import { Overview } from "./overview.js";
-import { words } from "../words.js";
 
 export class View {
   constructor(ui) {
@@ -43,8 +42,8 @@ export class View {
     this.overview.mark(this.chooser.request.robot);
     this.launch.disabled = !this.chooser.ready || !this.ui.drives || this.ui.startsRun;
     const { found } = this.chooser;
-    this.hint.textContent = found?.modes && !found.modes.some(({ jogs }) => Object.keys(jogs).length)
-      ? words("No mode of this YAML is driven from the robot's page. To jog from it, add `web: {type: web}` to `teleoperation`, and a mode with `teleop: web`.") : "";
+    say(this.hint, found?.modes && !found.modes.some(({ jogs }) => Object.keys(jogs).length)
+      ? "No mode of this YAML is driven from the robot's page. To jog from it, add `web: {type: web}` to `teleoperation`, and a mode with `teleop: web`." : "");
   }
 
   async start() {
