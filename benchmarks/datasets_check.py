@@ -35,18 +35,14 @@ CONSEQUENCES = {
 
 def make(folder: Path, episodes: int, each: int) -> dict[str, str]:
     """Record the episodes; name -> kind of its fault, empty for a good one."""
-    from ibrobot_testing.contexts import host_context
-    from made_runs import Made, Run, metadata
+    from made_runs import Run, record_run
     from planted_faults import DEMONSTRATED
-
-    from ibrobot_core.api import EpisodeEnd, EpisodeStart
-    from ibrobot_core.app import installed_plugins
 
     kinds = [kind for kind in DEMONSTRATED for _ in range(each)]
     kinds += [""] * (episodes - len(kinds))
     order = sorted(range(len(kinds)), key=lambda i: (i * 7919) % 10_007)  # mixed, but the same each time
-    descriptor = installed_plugins().find("recorder", "mcap")
-    truth = {}
+    truth: dict[str, str] = {}
+    copied = dict[int, str]()  # seed -> the one of an original and its copy that comes first
     for number, i in enumerate(order, 1):
         kind, name = kinds[i], f"episode_{number:06d}"
         options: dict[str, Any] = {"seed": FIRST_SEED + i, "seconds": 6.6 + 0.1 * (i % 5), "camera_hz": 5.0}
@@ -54,17 +50,9 @@ def make(folder: Path, episodes: int, each: int) -> dict[str, str]:
         if kind == "duplicate":  # of a good one
             options["seed"] = FIRST_SEED + len(kinds) - 1 - i % each
             options["seconds"] = 6.6 + 0.1 * ((options["seed"] - FIRST_SEED) % 5)
-        run = Run(acts=False, **options)
-        made, recorder = Made(run), descriptor.make(descriptor.options(), host_context())
-        summary = made.summary()
-        topics = {topic: one.type for topic, one in summary.topics.items()}
-        (folder / "episodes").mkdir(parents=True, exist_ok=True)
-        recorder.begin(EpisodeStart(folder / "episodes" / name, summary.start_ns, topics, metadata(run)))
-        for item in made.messages():
-            recorder.write(item.topic, item.message, item.received_ns)
-        recorder.end(EpisodeEnd(summary.end_ns, run.outcome, {}))
-        recorder.close()
-        truth[name] = kind
+        record_run(folder / "episodes" / name, Run(acts=False, **options))
+        first = copied.setdefault(options["seed"], name)
+        truth[name] = "duplicate" if first != name else "" if kind == "duplicate" else kind  # the later one is the copy
     return truth
 
 

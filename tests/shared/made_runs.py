@@ -14,7 +14,9 @@ from ibrobot_core.api import (
     MODEL_ANSWERS,
     ActionPart,
     Contract,
+    EpisodeEnd,
     EpisodeReader,
+    EpisodeStart,
     EpisodeSummary,
     Feature,
     Float64MultiArray,
@@ -201,6 +203,26 @@ def metadata(run: Run) -> dict[str, str]:
         "mode": "learned" if run.acts else "teleop", "prompt": run.prompt, "robot": "made",
         **({"policy": json.dumps(policy)} if run.acts else {}),
     }  # fmt: skip
+
+
+def record_run(folder: Path, run: Run) -> Path:
+    """Record a run as a bag, which needs ibrobot-plugin-mcap."""
+    from ibrobot_testing.contexts import host_context
+
+    from ibrobot_core.app import installed_plugins
+
+    descriptor = installed_plugins().find("recorder", "mcap")
+    made = Made(run)
+    summary = made.summary()
+    recorder = descriptor.make(descriptor.options(), host_context())
+    topics = {topic: each.type for topic, each in summary.topics.items()}
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    recorder.begin(EpisodeStart(folder, summary.start_ns, topics, metadata(run)))
+    for item in made.messages():
+        recorder.write(item.topic, item.message, item.received_ns)
+    recorder.end(EpisodeEnd(summary.end_ns, run.outcome, {}))
+    recorder.close()
+    return folder
 
 
 class _Maker:

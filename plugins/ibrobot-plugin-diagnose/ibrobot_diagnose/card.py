@@ -121,6 +121,8 @@ class Card:
     """The rig at its last episode, or when it was taken; None if it is unknown."""
     limits: tuple[Limits, ...] | None = None
     """The limits of the joints in its episodes, the widest; None if they are unknown."""
+    way_names: tuple[str, ...] = ()
+    """Names of the episodes of `ways`; empty if unknown, as in a file."""
 
     def quantile(self, name: str, level: float) -> float:
         """A quantile over the episodes, of `series`."""
@@ -184,8 +186,8 @@ class Card:
     @classmethod
     def _of(cls, facts: Mapping[str, Any]) -> Card:
         joints = tuple(str(each) for each in facts["joints"])
-        tables = {name: _table(facts[name], len(LEVELS), len(joints), name) for name in _QUANTILES}
-        poses = {name: _table(facts[name], None, len(joints), name) for name in ("starts", "ends")}
+        tables: dict[str, Any] = {name: _table(facts[name], len(LEVELS), len(joints), name) for name in _QUANTILES}
+        poses: dict[str, Any] = {name: _table(facts[name], None, len(joints), name) for name in ("starts", "ends")}
         poses["ways"] = _table(facts["ways"], None, WAY * len(joints), "ways")
         following = tuple(None if each is None else _finite(each, "following") for each in facts["following"])
         if len(following) != len(joints):

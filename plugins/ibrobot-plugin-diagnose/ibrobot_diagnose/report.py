@@ -13,6 +13,9 @@ from ibrobot_diagnose.cause import Diagnosis, Finding, Reference
 from ibrobot_diagnose.course import Course, course_of
 from ibrobot_diagnose.window import Window
 
+_LEAST = 5e-5
+"""Least mean difference that is shown in words [rad]."""
+
 
 @attrs.frozen(eq=False)
 class Explanation:
@@ -184,11 +187,14 @@ def between_lines(window: Window, course: Course | None) -> list[str]:
     if course is not None:
         shares = facts["mean_difference_rad"]
         total = sum(shares.values()) or 1.0
-        parts = ", ".join(f"{name} {value:.4f} rad ({100 * value / total:.0f} %)" for name, value in shares.items())
-        limits = ", ".join(f"{name} {100 * share:.1f} %" for name, share in facts["share_at_limit"].items() if share)
-        lines.append(
-            f"Mean difference from the newest answer to the arm: {parts}. Held without a plan "
-            f"{100 * facts['share_held']:.1f} % of the time, operated {100 * facts['share_operated']:.1f} %; at a "
-            f"limit: {limits or 'never'}."
-        )
+        parts = [
+            f"{name} {value:.4f} rad ({100 * value / total:.0f} %)" for name, value in shares.items() if value >= _LEAST
+        ]
+        lines.append(f"Mean difference from the newest answer to the arm: {', '.join(parts) or 'none'}.")
+        times = {
+            "held without a plan": facts["share_held"], "moved by an operator": facts["share_operated"],
+            **{f"at a limit of {name}": share for name, share in facts["share_at_limit"].items()},
+        }  # fmt: skip
+        if spent := [f"{what} for {100 * share:.1f} %" for what, share in times.items() if share]:
+            lines.append(f"Of the time, the arm was {', '.join(spent)}.")
     return lines

@@ -15,9 +15,9 @@ from command_line import run_here
 from ibrobot_diagnose.commands.check import lines_of
 from ibrobot_diagnose.references import read_episode
 from ibrobot_provenance.reports import Cases, ReportDescriptor, Text
-from made_runs import Made, Run, metadata
+from made_runs import Run, record_run
 
-from ibrobot_core.api import DatasetError, EpisodeEnd, EpisodeStart, RecorderError
+from ibrobot_core.api import DatasetError, RecorderError
 from ibrobot_core.app import installed_plugins
 
 pytestmark = [
@@ -26,33 +26,15 @@ pytestmark = [
 ]
 
 
-def record(folder, run):
-    """Record a made run as a bag."""
-    from ibrobot_testing.contexts import host_context
-
-    descriptor = installed_plugins().find("recorder", "mcap")
-    made = Made(run)
-    summary = made.summary()
-    recorder = descriptor.make(descriptor.options(), host_context())
-    topics = {topic: each.type for topic, each in summary.topics.items()}
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    recorder.begin(EpisodeStart(folder, summary.start_ns, topics, metadata(run)))
-    for item in made.messages():
-        recorder.write(item.topic, item.message, item.received_ns)
-    recorder.end(EpisodeEnd(summary.end_ns, run.outcome, {}))
-    recorder.close()
-    return folder
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Three demonstrations, and two runs."""
     root = tmp_path_factory.mktemp("episodes")
     for number in range(3):
-        record(root / "demos" / "episodes" / f"episode_{number + 1:06d}", Run(seed=number, acts=False, seconds=5))
+        record_run(root / "demos" / "episodes" / f"episode_{number + 1:06d}", Run(seed=number, acts=False, seconds=5))
     dark = Run(seed=20, seconds=4, outcome="failure", picture=lambda camera, picture, t_s: picture // 4)
-    record(root / "runs" / "episodes" / "episode_000001", dark)
-    record(root / "runs" / "episodes" / "episode_000002", Run(seed=21, seconds=4, latency_s=1.1, outcome="failure"))
+    record_run(root / "runs" / "episodes" / "episode_000001", dark)
+    record_run(root / "runs" / "episodes" / "episode_000002", Run(seed=21, seconds=4, latency_s=1.1, outcome="failure"))
     return root
 
 
@@ -105,7 +87,7 @@ def test_unreadable_episode_is_named_and_the_others_are_explained(folder, tmp_pa
 def test_check_says_how_many_episodes_it_could_not_read(damaged, says, folder, tmp_path):
     """That nothing was found says nothing of them."""
     for number in range(3):
-        record(tmp_path / f"pick/episodes/episode_{number}", Run(seed=number, acts=False, seconds=5, cameras=()))
+        record_run(tmp_path / f"pick/episodes/episode_{number}", Run(seed=number, acts=False, seconds=5, cameras=()))
     for number in range(damaged):
         (bag,) = (tmp_path / f"pick/episodes/episode_{number}").glob("*.mcap")
         bag.write_bytes(b"no bag")
@@ -119,7 +101,7 @@ def test_check_says_how_many_episodes_it_could_not_read(damaged, says, folder, t
 
 @pytest.mark.usefixtures("fork_server")
 def test_check_lists_the_worst_episode_first(folder):
-    record(folder / "demos" / "episodes" / "episode_000009", Run(seed=9, acts=False, seconds=9, idle_s=4.0))
+    record_run(folder / "demos" / "episodes" / "episode_000009", Run(seed=9, acts=False, seconds=9, idle_s=4.0))
     done = run_here("datasets", "check", folder / "demos", "--json", "--jobs", 1)
     assert done.returncode == 0, done.stderr
     checked = json.loads(done.stdout)
@@ -132,7 +114,7 @@ def test_check_lists_the_worst_episode_first(folder):
 @pytest.mark.usefixtures("fork_server")
 def test_episodes_of_a_single_reading_are_not_said_to_be_like_one_another(tmp_path):
     for number in range(2):
-        record(tmp_path / "episodes" / f"episode_{number}", Run(seed=number, acts=False, seconds=0.01, cameras=()))
+        record_run(tmp_path / "episodes" / f"episode_{number}", Run(seed=number, acts=False, seconds=0.01, cameras=()))
     done = run_here("datasets", "check", tmp_path, "--jobs", 1)
     assert done.returncode == 1
     assert done.stderr.count("nothing can be checked: it has 1 readings of joints") == 2
@@ -144,8 +126,8 @@ def test_check_writes_a_report_with_what_mends_each_episode(folder, tmp_path):
 
     demos = tmp_path / "demos" / "episodes"
     for number in range(3):
-        record(demos / f"episode_00000{number}", Run(seed=number, acts=False, seconds=5))
-    record(demos / "episode_000009", Run(seed=9, acts=False, seconds=14, idle_s=4.0, outcome="unknown"))
+        record_run(demos / f"episode_00000{number}", Run(seed=number, acts=False, seconds=5))
+    record_run(demos / "episode_000009", Run(seed=9, acts=False, seconds=14, idle_s=4.0, outcome="unknown"))
     done = run_here("datasets", "check", tmp_path / "demos", "--out", tmp_path / "check", "--jobs", 1)
     assert done.stdout.rstrip().endswith(f"report: {tmp_path / 'check' / 'report.html'}")
     page = (tmp_path / "check" / "report.html").read_text()
@@ -275,7 +257,7 @@ def test_explanation_is_a_report_of_pages(folder, tmp_path):
 
 
 def test_run_is_compared_with_one_that_worked(folder):
-    good = record(folder / "good" / "episode_000001", Run(seed=22, seconds=4))
+    good = record_run(folder / "good" / "episode_000001", Run(seed=22, seconds=4))
     (explained,) = json.loads(run_here("explain", folder / "runs:1", "--against", good, "--json").stdout)
     assert explained["causes"][0]["name"] == "picture_dark"
     both = run_here("explain", folder / "runs:1", "--against", good, "--data", folder / "demos")
@@ -324,7 +306,7 @@ def plain_dataset(tmp_path_factory):
     for number in range(3):
         shake = 0.05 if number == 1 else 0.0
         run = Run(seed=number, acts=False, seconds=5, cameras=(), shake=shake)
-        record(root / f"demos/episodes/episode_{number + 1:06d}", run)
+        record_run(root / f"demos/episodes/episode_{number + 1:06d}", run)
     done = run_here("convert", root / "demos", "--out", root / "set", "--jobs", 1)
     assert done.returncode == 0, done.stderr
     return root / "set"

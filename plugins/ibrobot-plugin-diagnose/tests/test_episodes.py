@@ -113,31 +113,32 @@ def test_joint_that_holds_something_stands_at_its_end(name, accused):
     assert ("saturated" in {each.name for each in diagnose(window, Reference()).findings}) == accused
 
 
-def test_copy_is_named_wherever_it_stands_in_the_dataset(others):
-    """Also in the part of the dataset with which an episode is not compared otherwise."""
+def test_later_copy_is_named_with_the_episode_that_it_copies(others):
+    """Also in the part of the dataset with which an episode is not compared otherwise; the earlier one is kept."""
+    seeds = (1, 2, None, 3, 4, 5, 1, 2, 1)  # None: an episode that cannot be used
     makers = []
-    for seed in (1, 2, 3, 4, 5, 1, 2):
+    for seed in seeds:
         makers.append(Maker())
-        makers[-1].add(demo(seed=seed))
-    makers.insert(3, Maker())  # one that cannot be used
-    ways = check.nearest_ways(makers)
-    named = [
-        "duplicate" in {each.name for each in diagnose(demo(seed=seed), with_ways(others, way)).findings}
-        for seed, way in zip((1, 2, 3, 4, 5, 1, 2), ways[:3] + ways[4:], strict=True)
-    ]
-    assert named == [True, True, False, False, False, True, True]
-    assert len(ways[3]) == 0
+        if seed is not None:
+            makers[-1].add(demo(seed=seed))
+    named = {}
+    for number, near in enumerate(check.nearest_earlier(makers)):
+        if near is not None:
+            card = attrs.evolve(others.card, ways=makers[near].ways[0], way_names=(f"episode_{near}",))
+            findings = diagnose(demo(seed=seeds[number]), Reference(card)).findings
+            texts = [each.evidence.text for each in findings if each.name == "duplicate"]
+            if texts:
+                named[number] = texts[0].partition(",")[0]
+    assert named == {
+        6: "The arm moves as in episode_0", 7: "The arm moves as in episode_1", 8: "The arm moves as in episode_0"
+    }  # fmt: skip
 
 
 def test_ways_of_no_episodes_and_of_robots_with_other_joints_are_not_compared():
-    assert check.nearest_ways([]) == []
+    assert check.nearest_earlier([]) == []
     moved = 0.02 * np.arange(120)[:, None]
-    makers = [Maker() for _ in range(4)]
-    assert [len(each) for each in check.nearest_ways(makers)] == [0] * 4
-    for maker, joints in zip(makers, (2, 3, 3, 1), strict=True):
+    makers = [Maker() for _ in range(5)]
+    assert check.nearest_earlier(makers) == [None] * 5
+    for maker, joints in zip(makers, (2, 3, 3, 1, 2), strict=True):
         maker.add(make_window(np.repeat(moved, joints, axis=1)))
-    assert [len(each) for each in check.nearest_ways(makers)] == [0, 1, 1, 0]
-
-
-def with_ways(reference, ways):
-    return Reference(attrs.evolve(reference.card, ways=ways))
+    assert check.nearest_earlier(makers) == [None, None, 1, None, 0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from importlib import reload
 from types import ModuleType
 from typing import Any
@@ -28,18 +29,22 @@ class Message:
     severity: str = ""
 
 
-def stand_ins(monkeypatch: pytest.MonkeyPatch, reasons: list[str]) -> list[Any]:
-    """Modules in place of both tools, which say these reasons of every episode; what they were given."""
+def stand_ins(
+    monkeypatch: pytest.MonkeyPatch, reasons: list[str], computes: Callable[[], object] = lambda: None
+) -> list[Any]:
+    """Modules in place of both tools, which compute this and say these reasons of every episode; what they get."""
     given: list[Any] = []
 
     def per_episode(dataset: Any) -> Any:
         given.append(dataset["episodes_data"][0])
+        computes()
         flagged = [Message(f"Episode 0: {'; '.join(reasons)}")] if reasons else []
         return Message_list([Message("1/1 episode(s) flagged"), *flagged])
 
     class Registry:
         def run_all(self, episode: Any, index: int) -> list[Message]:
             given.append(episode)
+            computes()
             return [Message(reason, "CHECK", "warning") for reason in reasons] + [Message("fine", "OTHER", "info")]
 
     @attrs.frozen
@@ -81,6 +86,14 @@ def test_what_a_tool_flags_is_shown_in_its_words(tool, monkeypatch):
 def _arrays(given: Any) -> list[Any]:
     found = given[1].values() if isinstance(given[1], dict) else given
     return [each for each in found if isinstance(each, np.ndarray)]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("tool", TOOLS)
+def test_numbers_of_a_joint_that_stands_still_warn_nobody(tool, monkeypatch):
+    """As lerobot-lint divides by its deviation."""
+    stand_ins(monkeypatch, ["it stands"], lambda: np.corrcoef(np.zeros(5), np.arange(5.0)))
+    assert diagnose(DEMO, Reference(), [TOOLS[tool]()]).first == tool
 
 
 @pytest.mark.parametrize("tool", TOOLS)

@@ -243,18 +243,20 @@ class OddPath(_Odd):
 
 
 class Duplicate(CardCause):
-    """The episode is that of another number."""
+    """The episode is a copy of another one."""
 
-    name, title = "duplicate", "no other episode is nearly the same"
+    name, title = "duplicate", "the episode is no copy of another one"
     needs = _SHOWN | {"card"}
-    remedy = "Drop one of the two: copies make the others count less, and a test on one of them means nothing."
+    remedy = "Drop it: copies make the others count less, and a test on one of the two means nothing."
 
     @override
     def compare(self, window: Window, card: Card) -> Evidence | None:
         if not np.isfinite(window.states).all(axis=1).any() or not len(card.ways):
             return None
-        distance = float(np.abs(card.ways - way_of(window)[None]).max(axis=1).min())
-        text = f"Another episode takes the same way, to {distance:.4f} rad: it is a copy, or nearly."
+        distances = np.abs(card.ways - way_of(window)[None]).max(axis=1)
+        near = int(distances.argmin())
+        distance, other = float(distances[near]), card.way_names[near] if card.way_names else "another episode"
+        text = f"The arm moves as in {other}, to {distance:.4f} rad: this episode is a copy of it, or nearly."
         return Evidence(text, distance, "rad", 0.004, likelihood(distance, 0.004, 0.001))
 
 

@@ -39,7 +39,8 @@ class _Tool(Cause):
         known = np.isfinite(window.states).all(axis=1) & np.isfinite(window.commands).all(axis=1)
         if known.sum() < 2:
             return None
-        reasons = self.reasons(window, window.states[known], window.commands[known])
+        with np.errstate(all="ignore"):  # lerobot-lint divides by the deviation of a joint that stands still
+            reasons = self.reasons(window, window.states[known], window.commands[known])
         text = f"{self.package} {version(self.package)} flags this episode: {reasons[0]}." if reasons else ""
         likely = _FLAGGED if reasons else 0.0
         return Evidence(text, float(len(reasons)), "reasons", 1.0, likely, details=tuple(reasons[1:_SHOWN]))

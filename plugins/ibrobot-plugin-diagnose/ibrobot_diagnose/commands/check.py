@@ -21,7 +21,7 @@ from ibrobot_diagnose.options import CheckOptions, CheckProgress, CheckReport
 from ibrobot_diagnose.pictures import Shown
 from ibrobot_diagnose.references import find_episodes, read_episode
 from ibrobot_diagnose.report import finding_facts
-from ibrobot_diagnose.window import Floats, Window
+from ibrobot_diagnose.window import Window
 
 _PARTS = 5
 """The episodes of a part are compared with the ones of the other parts."""
@@ -91,11 +91,11 @@ def _checked(
     readable = [episode for episode in episodes if episode in makers]
     parts = min(_PARTS, len(readable))
     cards = [_card([makers[each] for i, each in enumerate(readable) if i % parts != part]) for part in range(parts)]
-    ways = nearest_ways([makers[each] for each in readable])
-    jobs = [
-        Job(check_episode, (each, attrs.evolve(cards[i % parts], ways=way)))
-        for i, (each, way) in enumerate(zip(readable, ways, strict=True))
-    ]
+    jobs = []
+    for i, near in enumerate(nearest_earlier([makers[each] for each in readable])):
+        ways = np.empty((0, 0)) if near is None else makers[readable[near]].ways[0]
+        names = () if near is None else (readable[near].name,)
+        jobs.append(Job(check_episode, (readable[i], attrs.evolve(cards[i % parts], ways=ways, way_names=names))))
     results = {episode: result for episode, result in run(jobs)}
     listed = []
     for episode in (each for each in readable if each in results):
@@ -115,22 +115,21 @@ def _checked(
     return checked, {each["episode"]: results[Path(each["episode"])].shown for each in listed}
 
 
-def nearest_ways(makers: Sequence[Maker]) -> list[Floats]:
-    """The way of another episode that is nearest to that of each, whatever their parts, shape (1, WAY * J) each.
+def nearest_earlier(makers: Sequence[Maker]) -> list[int | None]:
+    """The earlier episode whose way is nearest to that of each: of two copies, the later one is to be dropped.
 
-    No row for an episode that has no way, or that is the only one with as many joints.
+    None for an episode that has no way, or before which there is none with as many joints.
     """
     rows = [each.ways[0] if each.ways else np.empty((1, 0)) for each in makers]
-    known = {
-        size: np.concatenate([each for each in rows if each.size == size]) for size in {each.size for each in rows}
-    }
-    nearest, numbers = [], Counter[int]()
-    for row in rows:
-        others = known[row.size]
-        far = np.abs(others - row).max(axis=1, initial=0.0)
-        far[numbers[row.size]] = np.inf  # itself
-        numbers[row.size] += 1
-        nearest.append(others[[far.argmin()]] if row.size and len(others) > 1 else others[:0])
+    numbers: dict[int, list[int]] = {}
+    for number, row in enumerate(rows):
+        numbers.setdefault(row.size, []).append(number)
+    nearest: list[int | None] = [None] * len(rows)
+    for size, alike in numbers.items():
+        ways = np.concatenate([rows[number] for number in alike])
+        for place in range(1, len(alike) if size else 0):
+            far = np.abs(ways[:place] - ways[place]).max(axis=1)
+            nearest[alike[place]] = alike[int(far.argmin())]
     return nearest
 
 
