@@ -15,6 +15,10 @@ _ALIKE = 0.7
 """Correlation from which an area shows the same, in focus or not."""
 _FEWEST = 4
 """Areas from which they count: fewer may be a thing that has moved."""
+_AROUND = 3
+"""How far around an area the table is looked for that an object has left [areas]: objects are smaller."""
+_EQUAL, _EQUAL_GREY = 0.1, 3.0
+"""Differences up to which colours are equal: a share of them, and grey values."""
 _DARK, _WHITE = 12.0, 245.0
 """Grey values between which colours are to be seen."""
 _FLIPS = {
@@ -35,7 +39,7 @@ class Looks:
     sharp: float
     """Contrast of the smallest details in relation to all; falls if the picture is blurred. 1 if it is the same."""
     covered: float
-    """Share of the areas with something to see in which there is nothing now."""
+    """Share of the areas with something to see in which there is nothing now, nor what is around them."""
     swapped: float
     """How many times as well the colours fit with red and blue exchanged."""
     flip: str
@@ -75,12 +79,11 @@ def looks_of(reference: NDArray[np.uint8], picture: NDArray[np.uint8], weight: G
                 for each in (one, two)
             ]
             sharp = float(np.median(sharpness[1] / np.maximum(sharpness[0], 1e-3)))
-        contrasts = [_deviation(each, weights)[rich] for each in (one, two)]
+        contrasts = [_deviation(each, weights) for each in (one, two)]
         gone = contrasts[1] < 0.3 * contrasts[0] * min(light, 1.0)
-        # Out of focus, what is large is still there.
-        kept = np.abs(light_now - light * light_then)[rich] < 0.1 * light * light_then[rich] + 3.0
-        hidden = gone & ~kept
-        covered = float(hidden.mean()) if hidden.sum() >= _FEWEST else 0.0
+        lit = float(np.median(((light_now + 2.0) / (light_then + 2.0))[both])) if both.sum() >= _FEWEST else light
+        hidden = rich & gone & _hidden(lit * then, now, gone)
+        covered = float(hidden.sum() / rich.sum()) if hidden.sum() >= _FEWEST else 0.0
     every = np.ones_like(weights)
     flip, flipped = _flip(*(_means(each, every).mean(axis=2) for each in (reference, picture)))
     return Looks(light, red, blue, sharp, covered, (plain + 0.03) / (other + 0.03), flip, flipped)
@@ -91,6 +94,27 @@ def _means(picture: NDArray[np.uint8], weights: NDArray[np.float32]) -> NDArray[
     total = weights.sum(axis=2) + 1e-6
     channels = [(areas_of(picture[..., i].astype(np.float32)) * weights).sum(axis=2) / total for i in range(3)]
     return np.stack(channels, axis=2).astype(np.float64)
+
+
+def _hidden(then: NDArray[np.float64], now: NDArray[np.float64], gone: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which areas are behind something, if there is nothing in them now, shape (rows, columns).
+
+    Not those that are as bright as before: out of focus, what is large is still there. Nor those in which an object has
+    left the table: they have the colour of an area nearby that is as it was. What covers the lens has its own.
+
+    Args:
+        then: the mean colour of each area, as it would be in the light of now, shape (rows, columns, 3).
+        now: likewise.
+        gone: where there is nothing now, but was, shape (rows, columns).
+    """
+    grey_then, grey_now = then.mean(axis=2), now.mean(axis=2)
+    result: NDArray[np.bool_] = np.abs(grey_now - grey_then) >= _EQUAL * grey_then + _EQUAL_GREY
+    same = ~gone & (np.abs(now - then) < _EQUAL * then + _EQUAL_GREY).all(axis=2)
+    for row, column in np.argwhere(gone & result):
+        around = tuple(slice(max(0, at - _AROUND), at + _AROUND + 1) for at in (row, column))
+        near, own = now[around][same[around]], now[row, column]
+        result[row, column] = not (np.abs(near - own) < _EQUAL * near + _EQUAL_GREY).all(axis=1).any()
+    return result
 
 
 def _deviation(values: Grey, weights: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -25,6 +25,14 @@ def blurred(picture):
     return np.asarray(Image.fromarray(picture).filter(ImageFilter.GaussianBlur(2.5)))
 
 
+def with_boxes(picture):
+    """Two striped boxes on the table."""
+    shown = picture.copy()
+    for row, column in ((24, 20), (120, 190)):
+        shown[row : row + 80, column : column + 90] = np.where(np.arange(90)[:, None] // 5 % 2, 235, 160)
+    return shown
+
+
 def covered(picture):
     hidden = picture.copy()
     hidden[:, : WIDTH // 2] = 20
@@ -107,6 +115,14 @@ def test_camera_that_may_be_on_the_arm_is_not_accused_if_the_arm_stands_elsewher
 )  # fmt: skip
 def test_what_is_wrong_with_pictures_is_named_first(scene, cause):
     assert compared(rig(attrs.evolve(scene, objects=5, arm=0.2).still()), THEN).first == cause
+
+
+def test_objects_that_have_left_a_plain_table_cover_nothing():
+    """The table around them is seen in their place; a thing before the lens has a colour of its own."""
+    then = rig(Scene(plain=True, made=with_boxes).still())
+    assert "picture_covered" not in verdicts(rig(Scene(plain=True, light=0.93, noise=2).still()), then)
+    hidden = Scene(plain=True, noise=2, made=lambda picture: covered(with_boxes(picture)))
+    assert verdicts(rig(hidden.still()), then)["picture_covered"] == "fail"
 
 
 def test_exchanged_cameras_are_named_first():
