@@ -91,7 +91,7 @@ class ContractChecks:
         if not spec.topic.startswith("/"):
             self.document.add((*key, "topic"), f"a topic starts with /, got {spec.topic!r}")
         if spec.image is not None and spec.image.rectify:
-            self.document.add((*key, "image", "rectify"), "needs a peripheral, which has the intrinsics of the camera")
+            self.document.add((*key, "image", "rectify"), "needs a peripheral's lens: camera_info is not read")
         spec = completed(spec)
         if not spec.type:
             self.document.add(key, f"needs a type, which topic {spec.topic} does not determine")

@@ -220,7 +220,7 @@ def test_missing_and_wrong_intrinsics_are_named(
     [
         (
             {"key": TOP, "topic": "/top", "type": "sensor_msgs/msg/Image", "image": {"rectify": True}},
-            "image.rectify: needs a peripheral, which has the intrinsics of the camera",
+            "image.rectify: needs a peripheral's lens: camera_info is not read",
         ),
         ({"key": TOP, "peripheral": "top", "image": {"rectify": "side.yaml"}}, "rectify"),
         ({"key": TOP, "peripheral": "top", "image": {"rectifi": True}}, "unknown key, did you mean 'rectify'"),
@@ -236,13 +236,35 @@ def test_where_it_has_no_meaning_it_is_refused(tmp_path: Path, observation: dict
         load_config(path, sim=True)
 
 
-def test_a_camera_of_a_type_without_intrinsics(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        (
+            {"type": "lerobot", "camera": "zmq"},
+            r"a peripheral of type 'lerobot' does not know the intrinsics of its cam",
+        ),
+        ({"type": "realsense"}, r"image.rectify: needs `info` of the camera: a calibration file"),
+    ],
+)
+def test_a_camera_without_intrinsics(tmp_path: Path, camera: dict[str, Any], message: str) -> None:
     path = robot(tmp_path)
     given = yaml.safe_load(path.read_text())
-    given["peripherals"] = [{"name": "top", "kind": "camera", "type": "realsense"}]
+    given["peripherals"] = [{"name": "top", "kind": "camera", **camera}]
     path.write_text(yaml.safe_dump(given, sort_keys=False))
-    with pytest.raises(ConfigError, match=r"a peripheral of type 'realsense' does not know the intrinsics of its cam"):
+    with pytest.raises(ConfigError, match=message):
         load_config(path, sim=True)
+
+
+def test_a_realsense_is_rectified_by_its_calibration_file(tmp_path: Path) -> None:
+    path = robot(tmp_path)
+    given = yaml.safe_load(path.read_text())
+    info = str(tmp_path / "lens.yaml")
+    given["peripherals"] = [
+        {"name": "top", "kind": "camera", "type": "realsense", "width": 128, "height": 96, "info": info}
+    ]
+    path.write_text(yaml.safe_dump(given, sort_keys=False))
+    part = Contract.from_config(load_config(path)).parts(TOP)[0]
+    assert part.model["rectify"]["d"] == [-0.3, 0.08, 0.002, -0.001, 0.0]
 
 
 def test_without_a_plugin_that_rectifies_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,9 +23,39 @@ ENCODING = option(
 JPEG_QUALITY = option(90, ge=1, le=100, help="JPEG quality of images that the camera does not send as JPEG")
 
 
+class Calibrated(Options):
+    """Options of a camera that may have a calibration file."""
+
+    info: Path | None
+
+    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
+        """Check that the calibration file can be read."""
+        if self.info is not None:
+            from ibrobot_camera.calibration import load_info
+
+            try:
+                load_info(self.info)
+            except SensorError as error:
+                yield OptionFault(("info",), str(error))
+
+    @property
+    def lens(self) -> Mapping[str, Any]:
+        """The intrinsics in the calibration file.
+
+        Raises:
+            SensorError: if it cannot be read, or there is none.
+        """
+        from ibrobot_camera.calibration import load_info
+        from ibrobot_camera.rectify import facts_of
+
+        if self.info is None:
+            raise SensorError("needs `info` of the camera: a calibration file, as `ibrobot camera calibrate` writes it")
+        return facts_of(load_info(self.info)(Header()))
+
+
 @documented
 @attrs.frozen
-class OpenCvOptions(Options):
+class OpenCvOptions(Calibrated):
     """Options of `type: opencv`: a V4L2 device, a network stream, or a video file."""
 
     device: int | str = option(
@@ -55,30 +85,6 @@ class OpenCvOptions(Options):
             raise ValueError("set both width and height, or neither")
         if self.fourcc is not None and len(self.fourcc) != 4:
             raise ValueError(f"fourcc must have four characters, e.g. MJPG, not {self.fourcc!r}")
-
-    def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterable[OptionFault]:
-        """Check that the calibration file can be read."""
-        if self.info is not None:
-            from ibrobot_camera.calibration import load_info
-
-            try:
-                load_info(self.info)
-            except SensorError as error:
-                yield OptionFault(("info",), str(error))
-
-    @property
-    def lens(self) -> Mapping[str, Any]:
-        """The intrinsics in the calibration file.
-
-        Raises:
-            SensorError: if it cannot be read, or there is none.
-        """
-        from ibrobot_camera.calibration import load_info
-        from ibrobot_camera.rectify import facts_of
-
-        if self.info is None:
-            raise SensorError("needs `info` of the camera: a calibration file, as `ibrobot camera calibrate` writes it")
-        return facts_of(load_info(self.info)(Header()))
 
     def devices(self) -> Mapping[str, str]:
         """The resolved path of a V4L2 device; streams and files can be opened more than once."""
@@ -111,7 +117,7 @@ class OpenCvOptions(Options):
 
 @documented
 @attrs.frozen
-class RealSenseOptions(Options):
+class RealSenseOptions(Calibrated):
     """Options of `type: realsense`, which needs the extra `realsense` of this package."""
 
     serial: str = option("", help="serial number; if empty, the only connected camera")
@@ -122,6 +128,9 @@ class RealSenseOptions(Options):
     encoding: str = ENCODING
     jpeg_quality: int = JPEG_QUALITY
     frame_id: str = option("", help="frame id of the messages; NAME_optical_frame if empty")
+    info: Path | None = option(
+        None, help="calibration file as of `opencv`, instead of the intrinsics that the camera stores; for `rectify`"
+    )
 
     def devices(self) -> Mapping[str, str]:
         """The stream of the camera."""

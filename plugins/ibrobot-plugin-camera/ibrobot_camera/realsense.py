@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from typing import Any, ClassVar, override
 
 import attrs
@@ -11,6 +12,7 @@ import numpy as np
 from ibrobot_ros2.jpeg import to_jpeg
 from numpy.typing import NDArray
 
+from ibrobot_camera.calibration import load_info
 from ibrobot_camera.camera import to_image
 from ibrobot_camera.capture import Pixels
 from ibrobot_camera.librealsense import load_library
@@ -196,12 +198,27 @@ class RealSenseCamera(Sensor):
         self._device: _Device | None = None
         self._number = 0
         self._last_ns = 0
+        self._info: Callable[[Header], CameraInfo] | None = None
 
     @override
     def open(self) -> None:
         if self._device is None:
+            try:
+                self._info = self._calibration()
+            except SensorError as error:
+                raise SensorError(f"camera {self._ctx.name}: {error}") from None
             self._device = _Device.use(self._options, self._ctx)
             self._number = self._device.number
+
+    def _calibration(self) -> Callable[[Header], CameraInfo] | None:
+        if self._options.info is None:
+            return None
+        info, (height, width) = load_info(self._options.info), self._options.picture
+        calibrated = info(Header())
+        if (calibrated.width, calibrated.height) != (width, height):
+            size = f"{calibrated.width}x{calibrated.height}"
+            raise SensorError(f"{self._options.info}: is for images of {size}, these are {width}x{height}")
+        return info
 
     @override
     def read(self, timeout_s: float) -> Image | CompressedImage | None:
@@ -229,10 +246,12 @@ class RealSenseCamera(Sensor):
     def latched(self) -> tuple[tuple[str, Message], ...]:
         if self._device is None:
             return ()
+        header = Header(self._ctx.clock.now_ns(), self._frame_id)
+        if self._info is not None:
+            return ((f"/camera/{self._ctx.name}/camera_info", self._info(header)),)
         i = self._device.intrinsics
         k = np.array([i.fx, 0, i.ppx, 0, i.fy, i.ppy, 0, 0, 1], dtype=np.float64)
         p = np.insert(k, (3, 6, 9), 0.0)
-        header = Header(self._ctx.clock.now_ns(), self._frame_id)
         info = CameraInfo(
             header, i.height, i.width, d=np.array(i.coeffs, dtype=np.float64), k=k, r=np.eye(3).ravel(), p=p
         )

@@ -79,13 +79,10 @@ class Rectifier:
             return image
         import cv2
 
-        whole, parts = self._maps
         if image.dtype == np.uint8:
-            result = cv2.remap(np.ascontiguousarray(image), whole, parts, cv2.INTER_LINEAR)
+            result = cv2.remap(np.ascontiguousarray(image), *self._maps, cv2.INTER_LINEAR)
         else:
-            # OpenCV takes the pixel to the upper left.
-            nearest = whole + (np.stack([parts % _PARTS, parts // _PARTS], axis=2) >= _PARTS // 2)
-            result = cv2.remap(np.ascontiguousarray(image), nearest.astype(np.int16), None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
+            result = cv2.remap(np.ascontiguousarray(image), self._nearest, None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
         return np.asarray(result, image.dtype).reshape(height, width, channels)
 
     @property
@@ -101,6 +98,12 @@ class Rectifier:
         d = self.d if self.d.size else np.zeros(4)
         whole, parts = make(self.k, d, self.r, self.p, (self.width, self.height), cv2.CV_16SC2)
         return np.asarray(whole, np.int16), np.asarray(parts, np.uint16)
+
+    @cached_property
+    def _nearest(self) -> NDArray[np.int16]:
+        """The nearest source of each pixel, shape (H, W, 2): of the maps, OpenCV takes the pixel to the upper left."""
+        whole, parts = self._maps
+        return whole + (np.stack([parts % _PARTS, parts // _PARTS], axis=2) >= _PARTS // 2).astype(np.int16)
 
 
 def facts_of(info: CameraInfo) -> dict[str, Any]:

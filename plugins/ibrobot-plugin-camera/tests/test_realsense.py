@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, override
 
+import attrs
 import numpy as np
 import pytest
 from ibrobot_camera import realsense
@@ -185,6 +187,32 @@ def test_colour_and_aligned_depth_share_a_camera(soft: SoftwareCamera) -> None:
     assert 1000 < distance <= 1000 + soft.number
     assert isinstance(info, CameraInfo)
     assert (info.k[0], info.p[3], info.p[11]) == (50.0, 0.0, 0.0)
+
+
+@pytest.mark.usefixtures("soft")
+def test_a_calibration_file_replaces_what_the_camera_stores(tmp_path: Path) -> None:
+    options = attrs.evolve(SMALL, info=calibration(tmp_path / "top.yaml", WIDTH))
+    top = RealSenseCamera(options, host_context("top", clock=RealClock()))
+    top.open()
+    ((topic, info),) = top.latched()
+    top.close()
+    assert isinstance(info, CameraInfo)
+    assert (topic, info.k[0], info.d[0]) == ("/camera/top/camera_info", 55.0, -0.1)
+    assert options.lens["d"][0] == -0.1
+    wrong = attrs.evolve(SMALL, info=calibration(tmp_path / "wide.yaml", 640))
+    with pytest.raises(SensorError, match=r"camera top: .*wide\.yaml: is for images of 640x48, these are 64x48"):
+        RealSenseCamera(wrong, host_context("top")).open()
+
+
+def calibration(path: Path, width: int) -> Path:
+    numbers = {
+        "camera_matrix": [55.0, 0.0, 32.0, 0.0, 55.0, 24.0, 0.0, 0.0, 1.0], "distortion_coefficients": [-0.1] * 5,
+        "rectification_matrix": np.eye(3).ravel().tolist(),
+        "projection_matrix": [55.0, 0.0, 32.0, 0.0, 0.0, 55.0, 24.0, 0.0, 0.0, 0.0, 1.0, 0.0],
+    }  # fmt: skip
+    document = {"image_width": width, "image_height": HEIGHT, "distortion_model": "plumb_bob"}
+    path.write_text(json.dumps({**document, **{name: {"data": data} for name, data in numbers.items()}}))
+    return path
 
 
 @pytest.mark.parametrize("soft", [0.0001], indirect=True)

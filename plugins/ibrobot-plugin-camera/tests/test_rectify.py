@@ -102,6 +102,21 @@ def test_depth_is_not_mixed_across_an_edge(dtype: type[np.generic]) -> None:
     np.testing.assert_array_equal(rectified[40:60, 5:120] == 2000, halfway[40:60, 5:120] >= 127)
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_maps_are_made_for_the_first_image_only(dtype: type[np.generic], monkeypatch: pytest.MonkeyPatch) -> None:
+    maps, remap = [], cv2.remap
+
+    def noted(image: Any, given: Any, *more: Any) -> Any:
+        maps.append(given)
+        return remap(image, given, *more)
+
+    monkeypatch.setattr(cv2, "remap", noted)
+    rectify = Rectifier.of(LENS)
+    for seed in range(2):
+        rectify(scene(seed, 1).astype(dtype))
+    assert maps[0] is maps[1]
+
+
 def test_what_the_lens_does_not_show_is_black() -> None:
     wide = [*P]
     wide[0] = wide[5] = 50.0
