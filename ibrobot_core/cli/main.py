@@ -69,7 +69,8 @@ class Commands(click.Group):
         if any(each.startswith(f"{name} ") for each in registry.commands):
             return Commands(name)
         if name not in registry.commands:
-            for each in (name, self._prefix.strip()):  # the words above may be a command that is not installed
+            above = self._prefix.strip()  # may be a command that is not installed, unless the word below is mistyped
+            for each in (name, "" if get_close_matches(cmd_name, self.list_commands(ctx)) else above):
                 if each in registry.official("command") and each not in registry.commands:
                     raise registry.not_found("command", each)
             return None

@@ -31,6 +31,7 @@ from ibrobot_core.plugins import Registry, installed_plugins
 from ibrobot_core.pulses import Pulse
 from ibrobot_core.run_hooks import RunHooks
 from ibrobot_core.safe_output import echo
+from ibrobot_core.schema import TerminalConfig
 from ibrobot_core.signals import end_signals
 
 NOT_ALL_SUCCEEDED = 3
@@ -101,12 +102,12 @@ def run_robot(
 def _terminal(config: RobotConfig, registry: Registry) -> RunTerminal | None:
     """The terminal of a run, or None and a warning if no plugin has one."""
     try:
-        type_ = registry.default("terminal")
+        chosen = config.terminal or TerminalConfig(type=registry.default("terminal"), options=Options())
     except PluginError as error:
         logging.getLogger("ibrobot").warning("neither panel nor keys, so Esc does not stop the robot: %s", error)
         return None
-    made: RunTerminal = registry.create("terminal", type_, Options(), Context.of(config, "terminal", RealClock()))
-    return made
+    context = Context.of(config, "terminal", RealClock())
+    return registry.create("terminal", chosen.type, chosen.options, context)  # type: ignore[no-any-return]
 
 
 def _run(

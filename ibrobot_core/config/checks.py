@@ -338,7 +338,7 @@ class Checks:
             self.document.refer(key, name, self.document.names("control_modes"), "control mode")
 
     def _transport(self) -> None:
-        part = self.sections.transport
+        part = self.sections.single.get("transport")
         faulty = any(key[:1] == ("transport",) for key in self.document.unread)
         if part is None or faulty or self.communicates or part.descriptor.type == "local":
             return
@@ -359,12 +359,13 @@ class Checks:
             self.document.add(key, f"{nearest} is not writable for this user")
 
     def _recording(self) -> None:
-        if self.sections.recording is not None:
-            self._folder(("recording", "root"), Path(self.sections.recording.component.root))
-        topics: Any = self.sections.recording.component.topics if self.sections.recording else ()
+        if (part := self.sections.single.get("recording")) is None:
+            return
+        self._folder(("recording", "root"), Path(part.component.root))
+        topics: Any = part.component.topics
         if isinstance(topics, str) and topics not in ("contract", "all"):
             self.document.add(("recording", "topics"), f"{topics!r} is not one of: contract, all, or a list of topics")
-        elif not topics and self.sections.recording:
+        elif not topics:
             message = "is empty; write contract for the contract's topics, or all for every topic"
             self.document.add(("recording", "topics"), message)
         for i, topic in enumerate(topics if isinstance(topics, tuple) else ()):

@@ -172,9 +172,7 @@ def _build(document: Document, source: Path, sim: bool, registry: Registry, comm
         "teleoperation": _components(sections.teleoperation),
         "contract": contract,
         "control": attrs.evolve(sections.plain.get("control") or ControlConfig(), guard=_component(sections.guard)),
-        "recording": _component(sections.recording),
-        "transport": _component(sections.transport),
-        "viewer": _component(sections.viewer),
+        **_components(sections.single),
         "plugin_sections": _components(sections.plugin_sections),
     }
     absent = {**_unread(robot, registry), **sections.absent_models}

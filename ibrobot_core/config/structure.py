@@ -25,6 +25,8 @@ from ibrobot_core.plugins import Registry, example_type
 
 MODELS = ("mjcf", "urdf", "srdf")
 """The keys of `robot.description` that name files."""
+_SINGLE = ("recording", "transport", "viewer", "terminal")
+"""The sections that are one component, and no more than that."""
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -54,9 +56,8 @@ class ParsedSections:
     """Per control mode."""
     inference: dict[str, ParsedComponent[schema.InferenceConfig]] = attrs.field(factory=dict)
     """Per control mode."""
-    recording: ParsedComponent[schema.RecordingConfig] | None = None
-    transport: ParsedComponent[schema.TransportConfig] | None = None
-    viewer: ParsedComponent[schema.ViewerConfig] | None = None
+    single: dict[str, ParsedComponent[Any]] = attrs.field(factory=dict)
+    """Those of `_SINGLE`."""
     guard: ParsedComponent[schema.GuardConfig] | None = None
     plugin_sections: dict[str, ParsedComponent[ComponentConfig]] = attrs.field(factory=dict)
     """The sections of plugins."""
@@ -69,7 +70,7 @@ class ParsedSections:
         """The components that a run opens when it starts."""
         yield from () if self.simulated else self.hardware.values()
         yield from self.peripherals.values()
-        yield from (part for part in (self.simulation, self.recording, self.transport, self.viewer, self.guard) if part)
+        yield from filter(None, (self.simulation, *self.single.values(), self.guard))
         yield from self.plugin_sections.values()
 
     def all(self) -> Iterator[ParsedComponent[Any]]:
@@ -137,10 +138,11 @@ class SectionParser:
                 if inference is not None and inference.component.intervene is not None:
                     self._need_source(key, "intervene", "intervene")
                 sections.inference |= {name: inference} if inference is not None else {}
-        sections.transport = self._component(("transport",), schema.TransportConfig)
-        sections.viewer = self._component(("viewer",), schema.ViewerConfig)
+        for name in _SINGLE:
+            kind: Any = schema.RobotConfig.sections()[name].type
+            if (part := self._component((name,), kind)) is not None:
+                sections.single[name] = part
         sections.guard = self._component(("control", "guard"), schema.GuardConfig)
-        sections.recording = self._component(("recording",), schema.RecordingConfig)
         return sections
 
     def _need_source(self, key: Key, type_: str, place: str) -> None:

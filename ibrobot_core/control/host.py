@@ -477,8 +477,3 @@ class ControlClient(ControlHost):
             self.holding = message.get("holding", [])
         else:
             self._on_event(message)
-
-    @property
-    def lost_states(self) -> int:
-        """The number of states overwritten before they were read."""
-        return self._memory.lost if self._memory is not None else 0

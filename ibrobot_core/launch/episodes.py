@@ -31,10 +31,6 @@ class Episodes:
         self.faults = ()
         session.emit("ibrobot_episode_started", episode=self.number, mode=session.mode)
 
-    def disturb(self, fault: str) -> None:
-        """Note a fault or emergency stop that has stopped the robot."""
-        self.faults = (*self.faults, fault)
-
     def judged(self, outcome: str) -> str:
         """Final outcome of the present episode, judged as `outcome`; never success after a fault or stop."""
         return "failure" if outcome == "success" and self.faults else outcome

@@ -375,7 +375,7 @@ class Session:
         self._faults.append((self.generation if generation is None else generation, fault))
         if generation is not None:
             self._stopped_by = generation, fault
-            self.episodes.disturb(fault)
+            self.episodes.faults += (fault,)
 
     @property
     def stopped_by(self) -> str:

@@ -85,6 +85,25 @@ def test_command_below_one_that_is_not_installed_names_the_package(ibrobot: Ibro
     assert (ran.code, ran.out, ran.err) == (2, "", message)
 
 
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("chek", "No such command 'chek', did you mean 'check'?; see `ibrobot plugins --help`"),
+        pytest.param(
+            "show",
+            "ibrobot plugins needs a plugin that is not installed: pip install ibrobot-terminal",
+            marks=pytest.mark.skipif(find_spec("ibrobot_terminal") is not None, reason="has the command"),
+        ),
+    ],
+)
+def test_a_word_below_a_command_that_is_not_installed_may_be_mistyped(
+    ibrobot: Ibrobot, site: Site, word: str, message: str
+) -> None:
+    site.add("commands-below", "commands_below.py")
+    ran = ibrobot("plugins", word)
+    assert (ran.code, ran.err) == (2, f"error: {message}\n")
+
+
 @pytest.mark.parametrize("command", ["config", "doctor"])
 def test_every_command_explains_itself(ibrobot: Ibrobot, command: str) -> None:
     ran = ibrobot(command, "--help")

@@ -209,7 +209,7 @@ class TestProcess:
         reports.state(arrived)
         assert ticks == sorted(set(ticks))
         # A host that was stopped for seconds comes too late for some, and says so.
-        assert ticks[-1] - first.tick + 1 - len(ticks) <= host.lost_states
+        assert ticks[-1] - first.tick + 1 - len(ticks) <= host._memory.lost
 
     @pytest.mark.parametrize("when", ["before it runs", "on the way"])
     def test_a_start_that_is_given_up_stops_the_robot(self, make, tmp_path, when):

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-import yaml
 from ibrobot_data.ticks import frames
 from ibrobot_netft.emulator import EmulatedNetFt
 from ibrobot_testing import ibrobot_command
 from independent import STORE, Sample, missing, samples
+from keeper_robot import keeper_robot
 from mcap.reader import make_reader
 from numpy.typing import NDArray
 from page_run import page_run
@@ -59,42 +59,10 @@ def device() -> Iterator[EmulatedNetFt]:
 
 
 def robot(folder: Path, device: EmulatedNetFt, policy: str = "fake", **observation: Any) -> Path:
-    limits = {"lower": -1.0, "upper": 1.0, "max_velocity": 2.0, "max_acceleration": 10.0}
-    joints = ("pan", "tilt")
-    given = {
-        "robot": {
-            "name": "tryout",
-            "joints": [{"name": each, **limits} for each in joints],
-            "groups": {"all": [*joints]},
-        },
-        "simulation": {"type": "fake"},
-        "peripherals": [
-            {
-                "name": "wrist",
-                "kind": "force",
-                "type": "netft",
-                "host": "localhost",
-                "port": device.port,
-                "silence": 60.0,
-            }
-        ],
-        "executors": {"joints": {"type": "position", "group": "all"}},
-        "models": {"keeper": {"type": policy}},
-        "control_modes": {"work": {"executors": ["joints"], "inference": {"model": "keeper"}}},
-        "default_control_mode": "work",
-        "recording": {"type": "mcap", "root": str(folder / "bags")},
-        "contract": {
-            "rate_hz": 20,
-            "observations": [
-                {"key": "observation.state", "topic": "/joint_states"},
-                {"key": "observation.force", "peripheral": "wrist", **observation},
-            ],
-            "actions": [{"key": "action", "executor": "joints", "topic": "/joints/commands"}],
-        },
-    }
-    path = folder / "tryout.yaml"
-    path.write_text(yaml.safe_dump(given, sort_keys=False))
-    return path
+    sensor = {
+        "name": "wrist", "kind": "force", "type": "netft", "host": "localhost", "port": device.port, "silence": 60.0,
+    }  # fmt: skip
+    return keeper_robot(folder, policy, sensor, {"key": "observation.force", "peripheral": "wrist", **observation})
 
 
 def test_a_policy_sees_forces_as_bag_and_dataset_have_them(site: Any, tmp_path: Path, device: EmulatedNetFt) -> None:

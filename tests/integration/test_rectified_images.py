@@ -18,6 +18,7 @@ from ibrobot_diagnose.pictures import shrink
 from ibrobot_diagnose.references import read_episode
 from ibrobot_diagnose.rig import STILL_WIDTH
 from ibrobot_testing import ibrobot_command
+from keeper_robot import keeper_robot
 
 from ibrobot_core.config import find_config, load_config
 from ibrobot_core.contract.check import check_policy
@@ -63,33 +64,8 @@ def robot(folder: Path, calibration: dict[str, Any] | None = CALIBRATION, policy
     if calibration is not None:
         (folder / "lens.yaml").write_text(yaml.safe_dump(calibration))
         camera["info"] = str(folder / "lens.yaml")
-    limits = {"lower": -1.0, "upper": 1.0, "max_velocity": 2.0, "max_acceleration": 10.0}
-    joints = ("pan", "tilt")
-    given = {
-        "robot": {
-            "name": "tryout",
-            "joints": [{"name": each, **limits} for each in joints],
-            "groups": {"all": [*joints]},
-        },
-        "simulation": {"type": "fake"},
-        "peripherals": [camera],
-        "executors": {"joints": {"type": "position", "group": "all"}},
-        "models": {"keeper": {"type": policy}},
-        "control_modes": {"work": {"executors": ["joints"], "inference": {"model": "keeper"}}},
-        "default_control_mode": "work",
-        "recording": {"type": "mcap", "root": str(folder / "bags")},
-        "contract": {
-            "rate_hz": 20,
-            "observations": [
-                {"key": "observation.state", "topic": "/joint_states"},
-                {"key": TOP, "peripheral": "top", "image": {"rectify": True, **image}},
-            ],
-            "actions": [{"key": "action", "executor": "joints", "topic": "/joints/commands"}],
-        },
-    }
-    path = folder / "tryout.yaml"
-    path.write_text(yaml.safe_dump(given, sort_keys=False))
-    return path
+    observation = {"key": TOP, "peripheral": "top", "image": {"rectify": True, **image}}
+    return keeper_robot(folder, policy, camera, observation)
 
 
 @pytest.fixture

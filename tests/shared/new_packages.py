@@ -16,9 +16,6 @@ from ibrobot_testing import ibrobot_command
 
 from ibrobot_core.app import installed_plugins
 
-LAST = ("terminal",)
-"""Kinds of which the only default is used: their packages cannot stand beside those of the repository."""
-
 
 def sample_kinds(*packages: str, without: Iterable[str] = ()) -> list[str]:
     """The kinds whose samples are in these packages, or in all but those of `without`."""

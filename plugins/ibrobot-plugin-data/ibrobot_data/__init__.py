@@ -40,14 +40,18 @@ def ibrobot_sources() -> Iterable[SourceDescriptor]:
 
 
 def _recording(options: EpisodesOptions | None, session: RecordedRun) -> Component:
+    from ibrobot_data.episode_service import EpisodeService
     from ibrobot_data.partial_recording import PartialRecording
     from ibrobot_data.recording_worker import NoRecording, RecordingWorker
 
     if session.config.recording is None:
         return NoRecording("recording", "of nothing")
     if options is None or options.keep == "all":
-        return RecordingWorker(session)
-    return PartialRecording(session, options)
+        worker = RecordingWorker(session)
+    else:
+        worker = PartialRecording(session, options)
+    EpisodeService(session, worker)
+    return worker
 
 
 def _records(config: RobotConfig) -> bool:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import shutil
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
 from types import NoneType
-from typing import TYPE_CHECKING, Literal, get_args, override
+from typing import TYPE_CHECKING, Any, Literal, get_args, override
 
 import attrs
 
@@ -146,7 +148,7 @@ class EpisodeService(Episodes):
 
     Args:
         session: the run.
-        recording: the worker that records them.
+        recording: the worker that records them; its run serves these episodes.
 
     Attributes:
         by_mode: whether the mode begins and ends episodes, so that an operator can only watch.
@@ -167,6 +169,8 @@ class EpisodeService(Episodes):
         self._by_agent = False
         """Whether an agent has asked for the present or last episode."""
         self._recording = recording
+        recording.episodes, recording.serving = self, self._served
+        recording.on_kept = partial(self.play, "saved")
         self.wanted: int | None = None
         self.earlier = 0
         self.waiting = False
@@ -437,23 +441,28 @@ class EpisodeService(Episodes):
             failure=str(failure) if failure is not None else "",
         )  # fmt: skip
 
-    def serve(self) -> None:
-        """Register the services on the bus."""
+    @contextmanager
+    def _served(self) -> Iterator[None]:
+        """Serve the services on the bus while the context is open."""
+        handlers: Mapping[Service[Any, Any], Callable[[Any], Any]] = {
+            START: lambda request: self.start(request.prompt, wait=request.wait),
+            REDO: lambda _: self.redo(),
+            STOP: lambda request: self.stop(request.outcome),
+            DISCARD: lambda _: self.discard(),
+            STATUS: lambda _: self.status(),
+            RECORD: lambda request: self.record(request.prompt),
+            PROGRESS: lambda _: self.progress(),
+            CANCEL: lambda _: self._cancel(),
+            INFO: lambda _: DatasetInfo(str(self.folder), count_complete(self.folder)),
+        }
         bus = self._session.bus
-        bus.serve(START, lambda request: self.start(request.prompt, wait=request.wait))
-        bus.serve(REDO, lambda _: self.redo())
-        bus.serve(STOP, lambda request: self.stop(request.outcome))
-        bus.serve(DISCARD, lambda _: self.discard())
-        bus.serve(STATUS, lambda _: self.status())
-        bus.serve(RECORD, lambda request: self.record(request.prompt))
-        bus.serve(PROGRESS, lambda _: self.progress())
-        bus.serve(CANCEL, lambda _: self._cancel())
-        bus.serve(INFO, lambda _: DatasetInfo(str(self.folder), count_complete(self.folder)))
-
-    def unserve(self) -> None:
-        """Remove the services from the bus."""
-        for service in (START, STOP, REDO, DISCARD, STATUS, RECORD, PROGRESS, CANCEL, INFO):
-            self._session.bus.unserve(service)
+        for service, handler in handlers.items():
+            bus.serve(service, handler)
+        try:
+            yield
+        finally:
+            for service in handlers:
+                bus.unserve(service)
 
     def _cancel(self) -> None:
         """End the present episode. An agent, or the end of its authority, ends only episodes that an agent began.

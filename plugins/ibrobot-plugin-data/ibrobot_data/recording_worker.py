@@ -9,6 +9,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import override
@@ -30,12 +31,12 @@ from ibrobot_core.api import (
 from ibrobot_core.app import (
     Component,
     ComponentFailed,
+    Episodes,
     Received,
     RecordedRun,
     SessionWorker,
     error_text,
 )
-from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.episode_start import episode_start, is_kept, model_topics, take_next_folder
 from ibrobot_data.written import WrittenEpisode, lost_text, read_back
 
@@ -79,6 +80,12 @@ class RecordingWorker(SessionWorker):
     """
 
     session: RecordedRun
+    episodes: Episodes
+    """Begins and ends its episodes, as the next two set by `EpisodeService`."""
+    serving: Callable[[], AbstractContextManager[None]]
+    """Serves what operators and other programs call, while its context is open."""
+    on_kept: Callable[[], None]
+    """Called when an episode is written and kept."""
     urgent = True
     may_wait = True
     keeps_whole = True
@@ -93,7 +100,6 @@ class RecordingWorker(SessionWorker):
         self._of_model: Mapping[str, str] = {}
         """Topics of the acting policy that an episode has beside those of the contract."""
         session.refuse_absent("the recording", self._keeps)
-        self.episodes = EpisodeService(session, self)
         self._pending: deque[tuple[int, Callable[[], None]]] = deque()
         """Pending begins and ends of episodes: stamp [ns] and action."""
         self._pending_lock = threading.Lock()
@@ -144,8 +150,7 @@ class RecordingWorker(SessionWorker):
         self.recorder: Recorder = session.make("recorder", self._config, "recording")
         self._incoming = session.bus.subscribe(None, _DEPTH, wants=self._keeps)
         self.on_end.callback(self._incoming.close)
-        self.episodes.serve()
-        self.on_end.callback(self.episodes.unserve)
+        self.on_end.enter_context(self.serving())
         self.on_end.callback(self._give_up)
         self.on_end.callback(self._did, self.recorder.close)
         self.on_end.callback(self.work, 0.0)
@@ -376,7 +381,7 @@ class RecordingWorker(SessionWorker):
         self.replaced = None
         if kept:
             self.kept = folder
-            self.episodes.play("saved")
+            self.on_kept()
         with self._pending_lock:
             self._ending -= 1
         self._report_absent()

@@ -10,14 +10,13 @@ from pathlib import Path
 
 import pytest
 from ibrobot_kit.new import SAMPLE, NewPlugin, render
-from new_packages import LAST, NewPackages, sample_kinds
+from new_packages import NewPackages, sample_kinds
 
 from ibrobot_core.api import Descriptor, IbrobotError
 from ibrobot_core.app import RequestError, installed_plugins, load_config
 
 KINDS = sample_kinds("ibrobot-testing")
 """Those of core; tests/integration/test_new_plugins.py has those of plugins."""
-TOGETHER = [kind for kind in KINDS if kind not in LAST]
 ROOT = Path(__file__).parents[3]
 
 
@@ -37,22 +36,20 @@ def test_every_kind_of_core_has_a_sample() -> None:
 
 
 def test_tests_of_new_packages_pass(packages: NewPackages) -> None:
-    here = [kind for kind in TOGETHER if kind != "message" or find_spec("ibrobot_ros2")]  # it encodes
-    for kinds in (here, *([kind] for kind in LAST)):
-        done = packages.tests(kinds)
-        assert done.returncode == 0, done.stdout
+    done = packages.tests([kind for kind in KINDS if kind != "message" or find_spec("ibrobot_ros2")])  # it encodes
+    assert done.returncode == 0, done.stdout
 
 
 def test_new_packages_are_discovered_without_mistakes_and_their_robots_are_right(
     packages: NewPackages, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for kind in TOGETHER:
+    for kind in KINDS:
         monkeypatch.syspath_prepend(str(packages.place(kind)))
     installed_plugins.cache_clear()
     registry = installed_plugins()
     installed_plugins.cache_clear()
     assert registry.failures == []
-    for kind in TOGETHER:
+    for kind in KINDS:
         interface = "sensor" if kind == "camera" else kind
         if interface in registry.all_kinds and kind != "source":
             descriptor = registry.find(interface, f"my_{kind}")

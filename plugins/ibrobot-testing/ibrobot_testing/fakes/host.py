@@ -1,4 +1,7 @@
-"""Fakes of components in the host: sensor, teleoperation device, policy, engine, source, viewer."""
+"""Fakes of components in the host: sensor, teleoperation device, policy, engine, source, viewer.
+
+`ibrobot plugins new` begins with one of them: each stands alone, also where two are alike.
+"""
 
 from __future__ import annotations
 
