@@ -62,7 +62,6 @@ from ibrobot_core.interfaces.hardware import (
     Severity as Severity,
     nan_vector as nan_vector,
 )
-from ibrobot_core.interfaces.teleop import Approach as Approach
 from ibrobot_core.deadman import Deadman as Deadman
 
 # Models

@@ -7,16 +7,10 @@ from collections.abc import Mapping
 from typing import ClassVar, Literal, Self
 
 import attrs
-import numpy as np
 
 from ibrobot_core.deadman import Deadman
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces.hardware import JointReading
-from ibrobot_core.robot import Vector
-from ibrobot_core.units import seconds
-
-_LONGEST_STEP_S = 0.1
-"""Longest time step of an approach, e.g. after a pause of the host [s]."""
 
 OperatorEvent = Literal["start", "success", "failure", "discard", "intervention"]
 """Requests of an operator to the run, by buttons of the device: begin an episode; end it as a success or a failure, or
@@ -133,41 +127,3 @@ class Teleop(ABC):
                 "or its class must set operated = False"
             )
         return attrs.evolve(command, positions=None)
-
-
-class Approach:
-    """The setpoints of a robot that approaches the pose of a leader at first, and then follows it directly.
-
-    Args:
-        tolerance: distance from the leader's pose at which the approach ends [rad].
-
-    Attributes:
-        setpoint: the last one [rad], shape (S,); set it to None to pause, and to begin with an approach again.
-        following: whether the approach has ended.
-    """
-
-    def __init__(self, tolerance: float) -> None:
-        self._tolerance = tolerance
-        self.setpoint: Vector | None = None
-        self.following = False
-        self._set_ns = 0
-
-    def next(self, measured: Vector, pose: Vector, speed: Vector, now_ns: int) -> Vector:
-        """The setpoint at a time, which moves from the measured positions to the leader's pose, shape (S,).
-
-        Args:
-            measured: positions of the robot's joints [rad], shape (S,).
-            pose: the leader's [rad], shape (S,).
-            speed: of the approach [rad/s], shape (S,).
-            now_ns: the time [ns].
-        """
-        elapsed_s, self._set_ns = min(seconds(now_ns - self._set_ns), _LONGEST_STEP_S), now_ns
-        if self.setpoint is None:
-            self.setpoint, self.following = measured, False
-            return measured
-        way = pose - self.setpoint
-        self.following |= bool(np.abs(way).max() <= self._tolerance)
-        # All joints arrive together; the one with the longest distance sets the pace.
-        share = float(np.min(speed * elapsed_s / np.maximum(np.abs(way), 1e-9)))
-        self.setpoint = pose if self.following or share >= 1.0 else self.setpoint + way * share
-        return self.setpoint

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import queue
 from collections.abc import Sequence
 from typing import override
 
 import attrs
 import numpy as np
 from ibrobot_calibration import load_calibration
-from ibrobot_terminal import HeldKeys
-from numpy.typing import NDArray
+from ibrobot_terminal.hand_moved import HandMoved
 
 from ibrobot_core.api import (
-    Approach,
     Context,
     HardwareError,
     JointReading,
@@ -78,20 +75,13 @@ class LeaderTeleop(Teleop):
 
         self._bus: FeetechBus | None = None
         self._reader: SyncReader | None = None
-        self._keys: queue.SimpleQueue[str] | None = None
+        self._hand = HandMoved(options, ctx, "leader arm", _TAKEN_UP)
         self._ticks = np.zeros(len(pairs), dtype=np.int32)
         """The last valid positions [ticks]."""
         self._ticks_ns = np.zeros(len(pairs), dtype=np.int64)
         """When they were read [ns]."""
         self._lost = np.zeros(len(pairs), dtype=np.int32)
         """Number of reads since then."""
-        self._approach = Approach(options.follow_tolerance)
-        self._toggled = False
-        self._held = HeldKeys(options.release)
-        self._resting: NDArray[np.int32] | None = None
-        """The leader's positions at the start of the mode [ticks]; None until they are read."""
-        self._taken_up = False
-        """Whether the leader was moved since then."""
         self._goal: Vector | None = None
         """The goal of its motors while they move it [ticks]."""
         self._driven_ns = 0
@@ -101,12 +91,7 @@ class LeaderTeleop(Teleop):
 
     @override
     def connect(self) -> None:
-        if self._options.deadman != "none" and self._ctx.keys is None:
-            raise TeleopError(
-                f"{self._ctx.name}: deadman: {self._options.deadman} needs a terminal: start ibrobot in one, without "
-                "--headless and without redirecting its input, or set deadman: none, so that the robot follows once "
-                "the leader arm is moved"
-            )
+        self._hand.check()
         port, baud_rate, retries = self._options.port, self._options.baud_rate, self._options.retries
         bus = FeetechBus(port, baud_rate=baud_rate, joints=self._arm.names, retries=retries)
         try:
@@ -126,7 +111,7 @@ class LeaderTeleop(Teleop):
         for odd in self._arm.oddities(by_angle):
             self._ctx.log.warning("%s: %s", self._arm.calibration.path, odd)
         self._bus, self._reader = bus, SyncReader(bus, self._arm.servos, "present_position")
-        self._keys = self._ctx.keys() if self._ctx.keys is not None else None
+        self._hand.connect()
 
     @override
     def approach(self, measured: JointReading) -> bool:
@@ -164,27 +149,20 @@ class LeaderTeleop(Teleop):
                 self._let_go()
             except HardwareError as error:
                 self._ctx.log.error("%s: %s", self._ctx.name, error)
-        self._held.take(self._keys, measured.stamp_ns)
-        self._held.forget()
-        self._release()
+        self._hand.activate(measured.stamp_ns)
 
     @override
     def read(self, measured: JointReading) -> TeleopCommand:
         if self._reader is None:
             raise TeleopError(f"{self._ctx.name}: the leader is not connected: call connect before read")
         now_ns = measured.stamp_ns
-        self._held.take(self._keys, now_ns)
+        self._hand.take(now_ns)
         self._receive(self._reader, now_ns)
         # A press counts with the oldest of the servos' positions.
-        self.deadman.report(self._engaged(), int(self._ticks_ns.min()))
-        if not self.deadman.allows(now_ns):
-            self._approach.setpoint = None
-            if not self.deadman.armed:
-                self._release()
-            return TeleopCommand(None)
-        setpoint = self._approach.next(measured.position[list(self._columns)], self._pose(), self._ramp, now_ns)
-        positions = dict(zip(self._joints, setpoint.tolist(), strict=True))
-        return TeleopCommand(positions, approaching=not self._approach.following)
+        engaged = self._hand.engaged(self._ticks, complete=not self._lost.any())
+        self.deadman.report(engaged, int(self._ticks_ns.min()))
+        where = measured.position[list(self._columns)]
+        return self._hand.command(self.deadman, self._joints, where, self._pose(), self._ramp, now_ns)
 
     @override
     def disconnect(self) -> None:
@@ -194,21 +172,14 @@ class LeaderTeleop(Teleop):
                 self._let_go()
         except HardwareError as error:
             self._ctx.log.error("%s: %s", self._ctx.name, error)
-        self._bus, self._reader, self._keys, self._goal = None, None, None, None
+        self._hand.disconnect()
+        self._bus, self._reader, self._goal = None, None, None
         if bus is not None:
             bus.close()
 
     @override
     def help(self) -> str:
-        key = self._options.deadman_key
-        start = {
-            "none": "move the leader arm to start",
-            "toggle": f"press {key} to follow the leader arm",
-            "hold": f"hold {key} to follow the leader arm{'' if self._held.exact else ' (known by its repeats)'}",
-        }
-        pause = {"none": "", "toggle": f": {key} pauses", "hold": f": release {key} to pause"}
-        deadman, paused = self._options.deadman, self._approach.setpoint is None
-        return f"PAUSED: {start[deadman]}" if paused else f"following the leader arm{pause[deadman]}"
+        return self._hand.help()
 
     def _check_names(self, option: str, names: Sequence[str], known: Sequence[str]) -> None:
         for name in names:
@@ -305,30 +276,6 @@ class LeaderTeleop(Teleop):
         assert self._bus is not None
         self._goal = None
         relax(self._bus, self._arm.servos)
-
-    def _release(self) -> None:
-        """Return to the paused state, so that following begins with an approach."""
-        self._approach.setpoint = self._resting = None
-        self._toggled = self._taken_up = False
-
-    def _engaged(self) -> bool:
-        """Whether the deadman is pressed."""
-        key = self._options.deadman_key
-        match self._options.deadman:
-            case "toggle":
-                self._toggled = self._held.toggled(key, self._toggled)
-                return self._toggled
-            case "hold":
-                return self._held.held(key)
-        return self._is_taken_up()
-
-    def _is_taken_up(self) -> bool:
-        """Whether the leader was moved since the mode began; False until every servo has answered once."""
-        if self._resting is None:
-            self._resting = None if self._lost.any() else self._ticks.copy()
-        elif not self._taken_up:
-            self._taken_up = bool(np.abs(self._ticks - self._resting).max() > _TAKEN_UP)
-        return self._taken_up
 
 
 def read_pose(options: LeaderOptions, ctx: Context) -> dict[str, float]:

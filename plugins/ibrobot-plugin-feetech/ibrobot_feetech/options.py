@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import attrs
+from ibrobot_terminal.hand_moved_options import HandMovedOptions
 
 from ibrobot_core.api import HardwareError, OptionFault, Options, did_you_mean, documented, not_empty, option
 
@@ -96,7 +97,7 @@ class FollowerOptions(Options):
 
 @documented
 @attrs.frozen
-class LeaderOptions(Options):
+class LeaderOptions(HandMovedOptions):
     """Options of `type: so101_leader`: an arm with STS3215 servos that is moved by hand."""
 
     port: str = option(
@@ -116,30 +117,11 @@ class LeaderOptions(Options):
     scaled: tuple[str, ...] = option(
         _GRIPPER, help="joints of the leader whose calibrated range maps to the robot's limits; others map by angle"
     )
-    ramp_velocity: float = option(
-        1.0,
-        unit="rad/s",
-        gt=0,
-        help="velocity at which the robot approaches the leader's pose, at first and after each pause",
-    )
-    follow_tolerance: float = option(
-        0.02, unit="rad", gt=0, help="distance from the leader's pose at which the approach ends"
-    )
     driven: bool = option(
         True,
         help="whether its motors move it to the robot's pose when an operator takes the robot from a policy, at "
         "ramp_velocity; otherwise the robot approaches the leader",
     )
-    deadman: str = option(
-        "toggle",
-        choices=("toggle", "hold", "none"),
-        help="toggle: space starts and pauses; hold: follows while space is held; none: follows once the leader arm "
-        "is moved, for runs without a terminal",
-    )
-    release: float = option(
-        0.2, unit="s", gt=0, le=1, help="deadman hold: a key that is not repeated for this long counts as released"
-    )
-    deadman_key: str = option("space", help="key of the deadman; two leaders may have the same or different ones")
     lost_replies: int = option(3, unit="reads", ge=0, help="consecutive replies of a servo that may be missing")
     retries: int = option(2, ge=0, help="retries of requests when the mode begins")
 
@@ -150,10 +132,6 @@ class LeaderOptions(Options):
     def pairs(self, robot: Robot) -> Mapping[str, str]:
         """Joint of the leader -> joint of the robot."""
         return self.joints or {joint.removeprefix(self.prefix): joint for joint in robot.joint_names}
-
-    def terminal_keys(self, robot: Robot) -> Mapping[str, str]:
-        """The keys of the terminal that it reads."""
-        return {} if self.deadman == "none" else {self.deadman_key: "deadman"}
 
     def check(self, robot: Robot, joints: tuple[str, ...]) -> Iterator[OptionFault]:
         """Check that the leader's joints map to joints of the robot, and that the self name joints of the leader."""

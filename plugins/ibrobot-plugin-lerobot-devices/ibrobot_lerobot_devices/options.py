@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import attrs
+from ibrobot_terminal.hand_moved_options import HandMovedOptions
 
 from ibrobot_core.api import OptionFault, Options, did_you_mean, documented, not_empty, option
 from ibrobot_lerobot_devices.units import UNITS, Choices
@@ -98,7 +99,7 @@ class RobotOptions(Options):
 
 @documented
 @attrs.frozen
-class TeleopOptions(Options):
+class TeleopOptions(HandMovedOptions):
     """Options of teleop `type: lerobot`: a teleoperator of LeRobot's with joint positions, e.g. a leader arm."""
 
     teleop: str = option(validator=not_empty, help="LeRobot's type of the teleoperator, e.g. koch_leader")
@@ -111,22 +112,6 @@ class TeleopOptions(Options):
         GRIPPER,
         help="joints whose values from 0 to 100, or from -100 to 100, map to the robot's limits; others map by angle",
     )
-    ramp_velocity: float = option(
-        1.0, unit="rad/s", gt=0, help="velocity at which the robot approaches the device's pose, also after each pause"
-    )
-    follow_tolerance: float = option(
-        0.02, unit="rad", gt=0, help="distance from the device's pose at which the approach ends"
-    )
-    deadman: str = option(
-        "toggle",
-        choices=("toggle", "hold", "none"),
-        help="toggle: a key starts and pauses; hold: follows while it is held; none: follows once the device is moved, "
-        "for runs without a terminal",
-    )
-    release: float = option(
-        0.2, unit="s", gt=0, le=1, help="deadman hold: a key that is not repeated for this long counts as released"
-    )
-    deadman_key: str = option("space", help="key of the deadman")
     lost_readings: int = _LOST
     blocked: float = option(0.2, unit="s", gt=0, help="how long a call of LeRobot's may block before it is a fault")
     start_timeout: float = _START
@@ -146,10 +131,6 @@ class TeleopOptions(Options):
     def devices(self) -> Mapping[str, str]:
         """The serial port, if the config has one."""
         return _port(self.config)
-
-    def terminal_keys(self, robot: Robot) -> Mapping[str, str]:
-        """The deadman."""
-        return {} if self.deadman == "none" else {self.deadman_key: "deadman"}
 
 
 @documented

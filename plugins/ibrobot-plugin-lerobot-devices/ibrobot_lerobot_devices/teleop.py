@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import queue
 from collections.abc import Mapping
 from typing import Any, override
 
 import numpy as np
-from ibrobot_terminal import HeldKeys
+from ibrobot_terminal.hand_moved import HandMoved
 
-from ibrobot_core.api import Approach, Context, JointReading, Teleop, TeleopCommand, TeleopError, Vector
+from ibrobot_core.api import Context, JointReading, Teleop, TeleopCommand, TeleopError, Vector
 from ibrobot_lerobot_devices.link import DeviceLink, DeviceProblem, age_ns
 from ibrobot_lerobot_devices.options import TeleopOptions
 from ibrobot_lerobot_devices.units import POSITION, UnitProblem, bases, columns, map_joints
@@ -30,38 +29,26 @@ class LeRobotTeleop(Teleop):
         self._options = options
         self._ctx = ctx
         self._link = DeviceLink("teleoperator", options.teleop, options.config, torch=options.torch)
-        self._keys: queue.SimpleQueue[str] | None = None
-        self._held = HeldKeys(options.release)
+        self._hand = HandMoved(options, ctx, "device", _TAKEN_UP)
         self._lost = 0
         self._pose: Vector | None = None
         """The device's pose [rad]; None until it is read."""
-        self._approach = Approach(options.follow_tolerance)
-        self._toggled = self._taken_up = False
-        self._resting: Vector | None = None
-        """The device's pose at the start of the mode [rad]; None until it is read."""
 
     @override
     def connect(self) -> None:
-        options = self._options
-        if options.deadman != "none" and self._ctx.keys is None:
-            raise self._error(
-                f"deadman: {options.deadman} needs a terminal: start ibrobot in one, without --headless and without "
-                "redirecting its input, or set deadman: none, so that the robot follows once the device is moved"
-            )
+        self._hand.check()
         try:
-            answer = self._link.start(options.start_timeout)
+            answer = self._link.start(self._options.start_timeout)
             self._map(answer)
         except (DeviceProblem, UnitProblem) as problem:
             self.disconnect()
             raise self._error(problem) from None
         self._pose, self._lost = None, 0
-        self._keys = self._ctx.keys() if self._ctx.keys is not None else None
+        self._hand.connect()
 
     @override
     def activate(self, measured: JointReading) -> None:
-        self._held.take(self._keys, measured.stamp_ns)
-        self._held.forget()
-        self._release()
+        self._hand.activate(measured.stamp_ns)
 
     @override
     def read(self, measured: JointReading) -> TeleopCommand:
@@ -70,38 +57,24 @@ class LeRobotTeleop(Teleop):
             answer = self._link.read(_WAIT_S)
         except DeviceProblem as problem:
             raise self._error(problem) from None
-        self._held.take(self._keys, now_ns)
+        self._hand.take(now_ns)
         engaged = None if answer is None else self._receive(answer)
         if engaged is not None:
             self.deadman.report(engaged, self._ctx.clock.now_ns() - age_ns(answer or {}))
         elif self._link.blocked_s > self._options.blocked:
             self._pose = None
             raise self._error(self._link.blockage("get_action"))
-        if not self.deadman.allows(now_ns) or self._pose is None:
-            self._approach.setpoint = None
-            if not self.deadman.armed:
-                self._release()
-            return TeleopCommand(None)
-        setpoint = self._approach.next(measured.position[self._columns], self._pose, self._ramp, now_ns)
-        positions = dict(zip(self._joints, setpoint.tolist(), strict=True))
-        return TeleopCommand(positions, approaching=not self._approach.following)
+        where = measured.position[self._columns]
+        return self._hand.command(self.deadman, self._joints, where, self._pose, self._ramp, now_ns)
 
     @override
     def disconnect(self) -> None:
-        self._keys = None
+        self._hand.disconnect()
         self._link.end()
 
     @override
     def help(self) -> str:
-        key, deadman = self._options.deadman_key, self._options.deadman
-        start = {
-            "none": "move the device to start",
-            "toggle": f"press {key} to follow the device",
-            "hold": f"hold {key} to follow the device{'' if self._held.exact else ' (known by its repeats)'}",
-        }
-        pause = {"none": "", "toggle": f": {key} pauses", "hold": f": release {key} to pause"}
-        paused = self._approach.setpoint is None
-        return f"PAUSED: {start[deadman]}" if paused else f"following the device{pause[deadman]}"
+        return self._hand.help()
 
     def _map(self, answer: Mapping[str, Any]) -> None:
         """Map the device's joints to the robot's.
@@ -136,26 +109,7 @@ class LeRobotTeleop(Teleop):
             return None
         self._lost = 0
         self._pose = np.clip(self._factor * np.array(values) + self._offset, self._lower, self._upper)
-        return self._engaged(self._pose)
-
-    def _release(self) -> None:
-        """Return to the paused state, so that following begins with an approach."""
-        self._approach.setpoint = self._resting = None
-        self._toggled = self._taken_up = False
-
-    def _engaged(self, pose: Vector) -> bool:
-        """Whether the deadman is pressed."""
-        key = self._options.deadman_key
-        match self._options.deadman:
-            case "toggle":
-                self._toggled = self._held.toggled(key, self._toggled)
-                return self._toggled
-            case "hold":
-                return self._held.held(key)
-        if self._resting is None:
-            self._resting = pose
-        self._taken_up = self._taken_up or bool(np.abs(pose - self._resting).max() > _TAKEN_UP)
-        return self._taken_up
+        return self._hand.engaged(self._pose)
 
     def _error(self, text: object) -> TeleopError:
         return TeleopError(f"{self._ctx.name}: {text}")
