@@ -151,6 +151,11 @@ class Capture:
         else:
             capture = cv2.VideoCapture(device.target, cv2.CAP_FFMPEG)
             why = "is not a video that can be decoded"
+            if capture.isOpened() and not capture.grab():
+                code = int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode(errors="replace")
+                capture.release()
+                raise self._error(f"OpenCV decodes no image of it (video format {code}); use MJPG or H.264")
+            capture = cv2.VideoCapture(device.target, cv2.CAP_FFMPEG)  # from the first image on
         if not capture.isOpened():
             capture.release()
             raise self._error(why)

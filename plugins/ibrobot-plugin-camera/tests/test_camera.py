@@ -335,7 +335,7 @@ class TestDevices:
     def test_what_a_device_means(self, device: int | str, kind: str, target: str) -> None:
         assert find_device(device) == Device(kind, target)
 
-    def test_missing_device_is_reported(self, tmp_path: Path) -> None:
+    def test_missing_device_is_reported(self, video: Path, tmp_path: Path) -> None:
         with pytest.raises(SensorError, match=r"camera top: no file, URL or device 'usb-cam'"):
             camera(host_context("top", clock=RealClock()), "usb-cam").open()
         with pytest.raises(SensorError, match=r"/dev/video77: there is no such device; `ibrobot camera list`"):
@@ -343,6 +343,9 @@ class TestDevices:
         (tmp_path / "no.mp4").write_text("no video")
         with pytest.raises(SensorError, match="is not a video that can be decoded"):
             camera(host_context("top"), str(tmp_path / "no.mp4")).open()
+        (tmp_path / "vvc.avi").write_bytes(video.read_bytes().replace(b"MJPG", b"VVC1"))
+        with pytest.raises(SensorError, match=r"vvc\.avi: OpenCV decodes no image of it \(video format vvc1\); use"):
+            camera(host_context("top"), str(tmp_path / "vvc.avi")).open()
 
     def test_a_name_that_stays_is_found_by_device_or_by_usb_port(self, tmp_path, monkeypatch):
         """Equal cameras without serial numbers have one name by id, but each its own by its port."""

@@ -242,7 +242,7 @@ def evaluate(hand: Hand, page: Any, look_at: Any) -> None:
     page.locator(".job:visible .state.done").first.wait_for(timeout=10 * _WAIT_MS)
     look_at(page, "way-18-evaluated")
     hand.press(page.locator(".job:visible").get_by_role("link", name=said(page, "Results")).first)
-    page.wait_for_timeout(3000)
+    page.locator(".report section").first.wait_for(timeout=_WAIT_MS)
     look_at(page, "way-19-results")
 
 

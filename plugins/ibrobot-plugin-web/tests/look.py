@@ -37,6 +37,7 @@ CHECKED = ("phone", "desktop")
 """Sizes at which axe checks: the layouts differ in these."""
 LANGUAGE = ["en"]
 """Language of the browser; the parts that press buttons know them in English."""
+LOADS = "(each) => each.checkVisibility() && each.textContent.endsWith('…')"
 PANELS = ("Plots", "Health", "Log")
 _SETTLE_MS = 400
 WRONG = """robot:
@@ -100,6 +101,14 @@ def view(page: Any, name: str) -> None:
     """Go to a view, and wait until it shows what it loads."""
     page.evaluate(f"location.hash = {name!r}")
     page.wait_for_timeout(2500)
+    loaded(page)
+
+
+def loaded(page: Any) -> None:
+    """Wait until no note says any more that something loads: `Reading …`, `Opening …`."""
+    from ui_path import until
+
+    until(page, f"![...document.querySelectorAll('.note')].some({LOADS})")
 
 
 def look_at_empty(chromium: Any, look: Look) -> None:

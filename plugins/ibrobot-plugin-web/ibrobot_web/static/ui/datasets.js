@@ -80,11 +80,12 @@ export class View {
   }
 }
 
-// One row for each value of a feature; pictures have one for each colour.
+// One row for each value of a feature; pictures have one for each colour. Below one another they say once whose they are.
 function rows({ key, dtype, shape, unit, names, stats, picture }) {
   const count = stats.mean?.length ?? 1;
   const colors = ["red", "green", "blue"];
-  return Array.from({ length: count }, (_, i) => row([...(i ? [h("td", {}), "", "", ""] : [key, dtype, shape.join(" × "), unit]),
+  return Array.from({ length: count }, (_, i) => row([
+    h("th", { scope: "row", class: i ? "same" : "" }, key), ...(i ? ["", "", ""] : [dtype, shape.join(" × "), unit]),
     picture && count === 3 ? colors[i] : names[i] ?? (count > 1 ? String(i) : ""),
     ...["min", "mean", "max", "std"].map((name) => ((stats[name]?.[i] ?? null) === null ? "" : rounded(stats[name][i])))]));
 }
