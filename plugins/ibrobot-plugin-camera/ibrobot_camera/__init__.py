@@ -69,10 +69,18 @@ def ibrobot_guides() -> Iterable[GuideDescriptor]:
         questions=Late("ibrobot_camera.guides:camera_questions"),
     )
     yield GuideDescriptor(
+        "board",
+        order=65,
+        label="Make a board to print",
+        summary="A page with the board that a calibration shows to a camera, at true size.",
+        make=Late("ibrobot_camera.commands.calibrate:make_board"),
+        questions=Late("ibrobot_camera.commands.calibrate:board_questions"),
+    )
+    yield GuideDescriptor(
         "lens",
         order=70,
         label="Calibrate a camera",
-        summary="Measure the lens of a camera with a printed board; `ibrobot camera board` makes the page to print.",
+        summary="Measure the lens of a camera with a printed board; “Make a board to print” makes its page.",
         make=Late("ibrobot_camera.commands.calibrate:guided"),
         questions=Late("ibrobot_camera.commands.calibrate:questions"),
     )

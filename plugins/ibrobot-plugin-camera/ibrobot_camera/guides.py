@@ -16,19 +16,23 @@ _ALL = "all"
 
 def camera_questions() -> Sequence[Question]:
     """Which camera: all, or one, as a robot YAML names it."""
-    names = tuple(camera.stable_id or camera.path for camera in v4l2.cameras())
+    names = tuple(camera.stable_id or camera.usb_path or camera.path for camera in v4l2.cameras())
     return (Question("camera", "Camera", _ALL, (_ALL, *names)),)
 
 
 def show_cameras(answers: Mapping[str, str | bool], guide: Guide) -> None:
     """Show what `device` of a robot YAML may be, and a picture of each camera."""
-    shown = [each for each in v4l2.cameras() if answers.get("camera", _ALL) in (_ALL, each.stable_id, each.path)]
+    shown = [
+        each
+        for each in v4l2.cameras()
+        if answers.get("camera", _ALL) in (_ALL, each.stable_id, each.usb_path, each.path)
+    ]
     if not shown:
         guide.say("No camera: there is no /dev/video*. Is it plugged in, and does `lsusb` show it?")
     for camera in shown:
         guide.say(f"{camera.path}: {camera.name}")
-        if camera.stable_id:
-            guide.say(f"better for a YAML, because it does not change: {camera.stable_id}")
+        for stays in filter(None, (camera.stable_id, camera.usb_path)):
+            guide.say(f"better for a YAML, because it does not change: {stays}")
         if camera.problem:
             guide.say(f"{camera.problem}: sudo usermod -aG video $USER, then log in again", warning=True)
             continue

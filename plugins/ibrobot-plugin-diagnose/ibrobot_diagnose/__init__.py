@@ -22,7 +22,9 @@ from ibrobot_diagnose.options import (
     CHECK_EVENTS,
     CHECK_KIND,
     EVENTS,
+    PREFLIGHT,
     PREFLIGHT_EVENTS,
+    PREFLIGHT_KIND,
     REPORT,
     SECTION,
     CheckOptions,
@@ -94,6 +96,10 @@ def _is_check(folder: Path) -> bool:
     return (folder / CHECK).is_file()
 
 
+def _is_preflight(folder: Path) -> bool:
+    return (folder / PREFLIGHT).is_file()
+
+
 def _explained(wanted: Any, place: Workplace) -> ExplainOptions:
     return ExplainOptions(jobs=1, out=place.out, **attrs.asdict(wanted, recurse=False))
 
@@ -104,7 +110,7 @@ def _checked(wanted: Any, place: Workplace) -> CheckOptions:
 
 @hookimpl
 def ibrobot_reports() -> Iterable[ReportDescriptor]:
-    """Explanations, and checks of datasets."""
+    """Explanations, checks of datasets, and preflights."""
     contents = "ibrobot_diagnose.contents"
     yield ReportDescriptor(
         REPORT_KIND,
@@ -136,4 +142,14 @@ def ibrobot_reports() -> Iterable[ReportDescriptor]:
             some_options(CheckOptions, "dataset", "least"),
             _checked,
         ),
+    )
+    preflights = "ibrobot_diagnose.preflight_contents"
+    yield ReportDescriptor(
+        PREFLIGHT_KIND,
+        summary="Whether rigs are what they were.",
+        label="Preflights",
+        command="preflight",
+        reads=_is_preflight,
+        lines=Late(f"{preflights}:lines_of"),
+        make=Late(f"{preflights}:read_contents"),
     )

@@ -16,7 +16,6 @@ from ibrobot_provenance.reports import Case, Cases, Plots, ReportSection, Table,
 from ibrobot_provenance.svg import axis_of, caption, grid_below, grid_beside, svg, tag
 
 from ibrobot_core.api import DatasetError
-from ibrobot_diagnose.cause import Finding
 from ibrobot_diagnose.options import REPORT
 from ibrobot_diagnose.pictures import Shown, png
 from ibrobot_diagnose.report import Explanation
@@ -227,30 +226,3 @@ def _players(explanation: Explanation) -> str:
     return (
         tag("h2", "What the cameras saw") + tag("div", "".join(players), class_="panels") + _PLAYER if players else ""
     )
-
-
-def write_preflight(out: Path, facts: Mapping[str, Any], findings: Sequence[Finding]) -> None:
-    """Write the comparison of a rig as JSON and as one HTML file into a folder."""
-    out.mkdir(parents=True, exist_ok=True)
-    rows = tuple(
-        (
-            each["verdict"], each["name"], each["text"], f"{each['number']:.3g} {each['unit']}",
-            f"{each['threshold']:.3g}", "" if each["fails"] is None else f"{each['fails']:.3g}",
-        )
-        for each in facts["lines"]
-    )  # fmt: skip
-    blocks: list[Text | Table | Plots | Cases] = [Text(facts["first"], "verdict")]
-    for each in facts["lines"]:
-        if each["verdict"] in ("fail", "warn"):
-            blocks += [Text(each["text"], "title"), *(Text(detail, "note") for detail in each["details"])]
-            blocks.append(Text(f"What to do: {each['remedy']}"))
-    table = Table(("verdict", "what", "how it is", "number", "warns from", "fails from"), rows)
-    sections = [ReportSection(facts["robot"], tuple(blocks)), ReportSection("What was compared", (table,))]
-    if untested := tuple((each["name"], each["why"]) for each in facts["untested"]):
-        sections.append(ReportSection(f"Not tested ({len(untested)})", (Table(("cause", "why"), untested),)))
-    if facts["notes"]:
-        sections.append(ReportSection("Notes", tuple(Text(note) for note in facts["notes"])))
-    bad = (each.evidence for each in findings if each.evidence.verdict in ("fail", "warn"))
-    shown = [each for evidence in bad for each in evidence.pictures]
-    replace_file(out / "report.html", as_page(out, facts["first"], sections, more=figures(shown)))
-    replace_file(out / "preflight.json", json.dumps(facts) + "\n")

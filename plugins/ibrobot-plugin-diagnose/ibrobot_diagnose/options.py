@@ -17,6 +17,9 @@ REPORT = "explanation.json"
 CHECK_KIND = "check"
 """The kind of report on a dataset."""
 CHECK = "check.json"
+PREFLIGHT_KIND = "preflight"
+"""The kind of report on a rig."""
+PREFLIGHT = "preflight.json"
 
 
 def _some(instance: object, attribute: object, paths: tuple[Path, ...]) -> None:
@@ -162,7 +165,7 @@ class PreflightOptions:
 
     robot: str | None = option(None, typed="ROBOT", names="robot", label="Robot", help="robot YAML")
     against: Path | None = option(
-        None, names="dataset", label="Against",
+        None, names="dataset", label="Against", open=True,
         help="the reference: one that was taken, or a dataset or checkpoint with its card",
     )  # fmt: skip
     take: Path | None = option(None, typed="--take FILE", label="Take", help="write a reference to this file")
@@ -171,7 +174,9 @@ class PreflightOptions:
     seconds: float = option(3.0, ge=0.5, le=10, unit="s", label="Duration", more=True, help="length of the window")
     lockstep: bool = option(False, label=None, help="look in simulated time; the loop's rate is then not measured")
     overrides: tuple[str, ...] = option((), typed="--set PATH=VALUE", label=None, help="e.g. control.rate_hz=50")
-    out: Path | None = option(None, label="Folder", help="folder for a report as HTML and JSON")
+    out: Path | None = option(
+        None, label="Folder", suggest="preflights/{robot}", help="folder for a report as HTML and JSON, with pictures"
+    )
 
 
 @attrs.frozen(kw_only=True)
@@ -186,6 +191,21 @@ class Looking(Event):
 
 
 @attrs.frozen(kw_only=True)
+class Difference(Event):
+    """Something is not as in the reference."""
+
+    name: str = option(help="the cause")
+    verdict: str = option(help="warn or fail")
+    text: str = option(help="what differs, in a sentence")
+    limits: str = option(help="the number, and those from which it warns and fails")
+    remedy: str = option(help="what to do")
+
+    @override
+    def shown(self) -> Shown:
+        return Shown("", problem=f"{self.text} {self.limits}\nWhat to do: {self.remedy}")
+
+
+@attrs.frozen(kw_only=True)
 class PreflightReport(Event):
     """The result."""
 
@@ -195,7 +215,8 @@ class PreflightReport(Event):
 
     @override
     def shown(self) -> Shown:
-        return Shown(self.lines[-1] if self.lines else self.verdict, 1.0)
+        made = {PREFLIGHT_KIND: self.out} if self.out else {}
+        return Shown(self.lines[-1] if self.lines else self.verdict, 1.0, made=made)
 
 
-PREFLIGHT_EVENTS = (Looking, PreflightReport)
+PREFLIGHT_EVENTS = (Looking, Difference, PreflightReport)

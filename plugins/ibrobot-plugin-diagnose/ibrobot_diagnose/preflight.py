@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import attrs
 
-from ibrobot_core.app import RobotConfig
+from ibrobot_core.app import Event, RobotConfig
 from ibrobot_diagnose.arm_view import with_moving
 from ibrobot_diagnose.card import Card
 from ibrobot_diagnose.cause import Diagnosis, Finding, Reference, Verdict
 from ibrobot_diagnose.diagnosis import diagnose
+from ibrobot_diagnose.options import Difference, PreflightReport
 from ibrobot_diagnose.report import finding_facts
 from ibrobot_diagnose.watch import LiveWindow
 from ibrobot_diagnose.window import Window
@@ -63,14 +64,33 @@ class Preflight:
         doubt = ", as far as that is certain" if self.verdict == "ok" and counts["cannot tell"] else ""
         return f"{robot} {says[self.verdict]}{taken}{doubt}: {told}."
 
+    def to_do(self, finding: Finding) -> str:
+        """What to do about a finding: its remedy, or first that of the finding that causes it."""
+        found = self.diagnosis.findings
+        number = next((i for i, each in enumerate(found) if each is finding), None)
+        source = self.diagnosis.source_of(number) if number is not None else None
+        if source is None:
+            return finding.cause.remedy
+        return f"First do what {found[source].name} asks for: this is probably a consequence of it."
+
     def facts(self) -> dict[str, Any]:
         """The result as a JSON object."""
         return {
             "robot": self.window.name, "verdict": self.verdict, "first": self.first,
-            "lines": [_line_facts(each) for each in self.findings],
+            "lines": [{**_line_facts(each), "remedy": self.to_do(each)} for each in self.findings],
             "untested": [{"name": name, "why": why} for name, why in self.diagnosis.untested],
             "notes": list(self.notes), "taken": str(self.file or ""), "lines_of_text": self.lines(),
         }  # fmt: skip
+
+    def events(self, out: Path | None) -> Iterator[Event]:
+        """The result as events: each difference, worst first, and the report in a folder."""
+        for each in self.findings:
+            if each.evidence.verdict in ("fail", "warn"):
+                yield Difference(
+                    name=each.name, verdict=each.evidence.verdict, text=each.evidence.text, limits=_limits(each),
+                    remedy=self.to_do(each),
+                )  # fmt: skip
+        yield PreflightReport(verdict=self.verdict, lines=tuple(self.lines()), out=str(out or ""))
 
     def lines(self) -> list[str]:
         """The result for a terminal."""
@@ -81,7 +101,7 @@ class Preflight:
             if evidence.verdict != "ok":
                 lines += [f"      {detail}" for detail in evidence.details]
             if evidence.verdict in ("warn", "fail"):
-                lines.append(f"      What to do: {each.cause.remedy}")
+                lines.append(f"      What to do: {self.to_do(each)}")
         lines += [f"note  {note}" for note in self.notes]
         lines += [f"note  {name} was not tested: {why}" for name, why in self.diagnosis.broken]
         lines.append(self.first)
@@ -91,7 +111,7 @@ class Preflight:
 
     def write(self, out: Path) -> None:
         """Write the report as JSON and as one HTML file into a folder."""
-        from ibrobot_diagnose.contents import write_preflight
+        from ibrobot_diagnose.preflight_contents import write_preflight
 
         write_preflight(out, self.facts(), self.findings)
 

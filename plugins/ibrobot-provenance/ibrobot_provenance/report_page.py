@@ -33,7 +33,8 @@ svg .estimate { stroke: var(--ok); stroke-width: 2; fill: none; } svg .zero { st
 svg .margin { stroke: var(--muted); stroke-dasharray: 4 4; }
 .panels { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(320px, 100%), 1fr)); gap: 1rem; }
 .failure { background: var(--card); border-radius: 8px; padding: .8rem; min-width: 0; }
-.failure h3 { margin: 0 0 .4rem; font-size: 1rem; } video { width: 100%; border-radius: 4px; background: #000; }
+.failure h3 { margin: 0 0 .4rem; font-size: 1rem; }
+video, .failure img { width: 100%; border-radius: 4px; background: #000; }
 code { font: 12.5px/1.4 ui-monospace, monospace; } h1, h2, h3, code, p, a, .text { overflow-wrap: anywhere; }
 a { color: var(--ok); } p { max-width: 75ch; }
 """
@@ -84,6 +85,10 @@ def _case(out: Path, case: Case) -> str:
     if case.video is not None:
         source = f"data:video/mp4;base64,{base64.b64encode(case.video.read_bytes()).decode()}"
         lines.append(tag("video", "", src=source, controls="", muted="", preload="metadata"))
+    if case.picture is not None:
+        kind = "png" if case.picture.suffix == ".png" else "jpeg"
+        source = f"data:image/{kind};base64,{base64.b64encode(case.picture.read_bytes()).decode()}"
+        lines.append(tag("img", src=source, alt=case.title))
     lines.append(tag("div", escape(case.text), class_="text"))
     if case.episode is not None:
         recording = str(case.episode.relative_to(out) if case.episode.is_relative_to(out) else case.episode)

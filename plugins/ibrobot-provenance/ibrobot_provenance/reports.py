@@ -64,13 +64,15 @@ class Fix:
 
 @attrs.frozen
 class Case:
-    """An episode worth a look."""
+    """An episode, or a picture, worth a look."""
 
     title: str
     text: str
     episode: Path | None
     """Its recording; None if there is none."""
     video: Path | None = None
+    picture: Path | None = None
+    """A PNG or JPEG file."""
     command: str = ""
     """The command that repeats it."""
     at_s: float = 0.0

@@ -25,6 +25,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
 _HINT_S = 2.0
 """Least time between two hints [s]."""
 _BOARD = Path("board.pdf")
+_PRINT = "Print it at 100 %, measure a row of squares, and glue it onto something flat and stiff."
 _SQUARES = re.compile(r"\s*(\d{1,3})\s*[xX\u00d7*]\s*(\d{1,3})\s*")
 
 type Read = Callable[[float], NDArray[np.uint8] | None]
@@ -46,7 +47,7 @@ class MakeBoard(Board):
         with wrong_input():
             self.save(self.output, self.paper)
         echo(f"{self.output}: {self.columns}x{self.rows} squares of {self.square:g} mm on {self.paper}")
-        echo("print it at 100 %, measure a row of squares, and glue it onto something flat and stiff")
+        echo(_PRINT)
 
 
 @attrs.frozen(kw_only=True)
@@ -144,16 +145,46 @@ def camera(source: str, name: str = "") -> Iterator[tuple[str, Read]]:
         yield name, read
 
 
+def of_board() -> tuple[Question, ...]:
+    """Size of the board, for `board_of`."""
+    return (
+        Question("squares", "Squares of the board, columns x rows", "10 x 7"),
+        Question("square", "Side of a square of the printed board [mm]", "25"),
+    )
+
+
+def board_questions() -> tuple[Question, ...]:
+    """Of the guide that makes a board."""
+    return (
+        *of_board(),
+        Question("paper", "Paper", next(iter(PAPERS)), tuple(PAPERS)),
+        Question("file", "File to write", str(_BOARD)),
+    )
+
+
+def make_board(answers: Mapping[str, str | bool], guide: Guide) -> None:
+    """Make a board from a page.
+
+    Raises:
+        IbrobotError: if an answer makes no sense, the paper is too small, or the file cannot be written.
+    """
+    board, path, paper = board_of(answers), Path(str(answers["file"]).strip()), str(answers["paper"])
+    board.save(path, paper)
+    small = cv2.resize(board.page(paper), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    guide.picture("the page", bytes(cv2.imencode(".png", small)[1].tobytes()))
+    guide.say(f"{path.absolute()} is written.")
+    guide.say(_PRINT)
+
+
 def questions() -> tuple[Question, ...]:
     """Of the guide for pages."""
     from ibrobot_camera import v4l2
 
-    names = tuple(each.stable_id or each.path for each in v4l2.cameras())
+    names = tuple(each.stable_id or each.usb_path or each.path for each in v4l2.cameras())
     return (
         Question("camera", "Camera", names[0] if names else "", names, open=True),
         Question("file", "File to write", "camera.yaml"),
-        Question("squares", "Squares of the board, columns x rows", "10 x 7"),
-        Question("square", "Side of a square of the printed board [mm]", "25"),
+        *of_board(),
         Question("chessboard", "The board is a plain chessboard, without markers", default=False),
     )
 

@@ -16,7 +16,7 @@ from ibrobot_provenance.files import replace_file
 from ibrobot_terminal import Guide, Question
 
 from ibrobot_camera.calibration import load_info
-from ibrobot_camera.commands.calibrate import board_of
+from ibrobot_camera.commands.calibrate import board_of, of_board
 from ibrobot_camera.intrinsics.board import Board
 from ibrobot_camera.mounting.edit import with_transform
 from ibrobot_camera.mounting.episode import Source
@@ -194,8 +194,8 @@ def questions() -> tuple[Question, ...]:
         Question("camera", "Camera", "wrist"),
         Question("on", "Link that carries the camera", "gripper_link"),
         Question("board_on", "Link that carries the board; empty for the base"),
-        Question("squares", "Squares of the board, columns x rows", "10 x 7"),
-        Question("square", "Side of a square of the printed board [mm]", "25"),
+        Question("board_at", "Where the board is, if it was measured: X,Y,Z [m], ROLL,PITCH,YAW [rad]"),
+        *of_board(),
         Question("simulated", "Use its simulation", default=False),
     )
 
@@ -211,7 +211,7 @@ def guided(answers: Mapping[str, str | bool], guide: Guide) -> None:
     mount = MountCamera(
         columns=board.columns, rows=board.rows, square=board.square, robot=given["robot"],
         episodes=(Path(given["episode"]).expanduser(),), camera=given["camera"], on=given["on"],
-        board_on=given["board_on"], sim=answers["simulated"] is True,
+        board_on=given["board_on"], board_at=given["board_at"], sim=answers["simulated"] is True,
     ).measured()  # fmt: skip
     for line in mount.mounting.lines():
         guide.say(line)

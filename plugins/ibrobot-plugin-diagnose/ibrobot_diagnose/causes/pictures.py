@@ -177,8 +177,9 @@ class CameraMoved(PictureCause):
     explains = UNSEEN | {"joint_zero", "gripper_reversed"}
     unit, threshold, certain = "pixels", 1.0, 2.0
     remedy = (
-        "Put the camera back: the two pictures of the report (`--out`) show where it was; `ibrobot preflight` says how "
-        "far it still is. If it must stay there, record some episodes from its new place and train again."
+        "Put the camera back: “Put a camera back” under “Devices” of the page shows its live picture over that of "
+        "then, and how far it still is; the report (`--out`) has both pictures. If it must stay there, record some "
+        "episodes from its new place and train again."
     )
 
     @override

@@ -17,11 +17,12 @@ from ibrobot_core.app import (
     load_config,
     wrong_input,
 )
-from ibrobot_diagnose.options import Looking, PreflightOptions, PreflightReport
+from ibrobot_diagnose.options import Looking, PreflightOptions
 from ibrobot_diagnose.references import reference_of
 
 if TYPE_CHECKING:
     from ibrobot_diagnose.card import Card
+    from ibrobot_diagnose.preflight import Preflight as Result
 
 
 @attrs.frozen(kw_only=True)
@@ -47,11 +48,11 @@ class Preflight(PreflightOptions):
             find_config(self.robot, installed_plugins()), overrides=self.overrides, mode=self.mode, sim=self.sim
         )
         card = reference_of(self.against) if self.against is not None else None
-        facts = _looked(self, config, card, emit)
+        result = _looked(self, config, card, emit)
+        facts = result.facts()
         if emit is not None:
-            emit(
-                PreflightReport(verdict=facts["verdict"], lines=tuple(facts["lines_of_text"]), out=str(self.out or ""))
-            )
+            for event in result.events(self.out):
+                emit(event)
         if facts["verdict"] == "fail":
             raise Unsuccessful(None if emit is not None else facts)
         return None if emit is not None else facts
@@ -62,7 +63,7 @@ class Preflight(PreflightOptions):
             echo(line)
 
 
-def _looked(options: PreflightOptions, config: RobotConfig, card: Card | None, emit: Emit) -> dict[str, Any]:
+def _looked(options: PreflightOptions, config: RobotConfig, card: Card | None, emit: Emit) -> Result:
     from ibrobot_diagnose.card import make_card
     from ibrobot_diagnose.live import look
     from ibrobot_diagnose.preflight import compared
@@ -78,4 +79,4 @@ def _looked(options: PreflightOptions, config: RobotConfig, card: Card | None, e
         result = result.taken(options.take)
     if options.out is not None:
         result.write(options.out)
-    return result.facts()
+    return result

@@ -9,7 +9,7 @@ from ibrobot_terminal import Guide
 
 from ibrobot_core.api import HardwareError, option
 from ibrobot_feetech.commands.dialogue import TerminalGuide
-from ibrobot_feetech.usb import UsbPort, usb_ports
+from ibrobot_feetech.usb import BY_SERIAL, UsbPort, usb_ports
 
 
 @attrs.frozen(kw_only=True)
@@ -61,7 +61,7 @@ def _show(guide: Guide, port: UsbPort) -> None:
     arm = " (an SO-101's adapter)" if port.is_arm else ""
     number = f", serial number {port.serial_number}" if port.serial_number else ""
     guide.say(f"{port.path}  {port.description}, USB {port.usb_id}{number}{arm}")
-    if port.stable:
-        guide.say(f"    better for a YAML, because it does not change: {port.stable}")
+    if stays := port.stable or (port.serial_number and f"{BY_SERIAL}{port.serial_number}"):
+        guide.say(f"    better for a YAML, because it does not change: {stays}")
     if not port.permitted:
         guide.say("    no permission: sudo usermod -aG dialout $USER, then log in again")

@@ -30,7 +30,7 @@ from ibrobot_core.app import (
 )
 from ibrobot_mujoco.identification.contents import PARAMETERS, write_report
 from ibrobot_mujoco.identification.excitation import excitation, plainly
-from ibrobot_mujoco.identification.options import IdentifyOptions, IdentifyProgress, IdentifyReport
+from ibrobot_mujoco.identification.options import Excited, IdentifyOptions, IdentifyProgress, IdentifyReport
 from ibrobot_mujoco.identification.recordings import Recording, find_recordings, read_recordings
 from ibrobot_mujoco.options import MujocoOptions
 from ibrobot_mujoco.parameters import read_parameters
@@ -53,7 +53,9 @@ class Identify(IdentifyOptions):
         if (self.excite is None) == (not self.episodes):
             raise RequestError("give recordings to identify from, or --excite ROBOT to make one")
         if self.excite is not None:
-            self._excite(self.excite)
+            folder = self._excite(self.excite)
+            if emit is not None:
+                emit(Excited(dataset=str(folder)))
             return None
         if self.out is not None and self.out.exists() and not self.out.is_dir():
             raise RequestError(f"--out {self.out}: is a file; name a folder")
@@ -98,10 +100,10 @@ class Identify(IdentifyOptions):
     def _read(self, tell: Callable[[str, float], None]) -> tuple[RobotConfig, list[Recording]]:
         """The robot, and its recordings."""
         paths = find_recordings(self.episodes)
-        config = _named(self.robot, self.overrides) if self.robot is not None else None
+        config = _named(self.robot, self._changes) if self.robot is not None else None
         given = self._given(config)
         if config is None:
-            config = _recorded(paths[0], self.overrides)
+            config = _recorded(paths[0], self._changes)
         recordings = []
         for number, path in enumerate(paths):
             tell(f"reads {path.name}", 0.02 * number / len(paths))
@@ -122,11 +124,20 @@ class Identify(IdentifyOptions):
         contract = Contract.from_config(config).without_signals()
         return robot_metadata(contract, document, calibrations) | {"norm_mode": self.norm_mode}
 
-    def _excite(self, robot: str) -> None:
-        """Move the robot, and record it."""
+    @property
+    def _changes(self) -> tuple[str, ...]:
+        """The overrides of the robot YAML, which may be options of a viewer."""
+        return (*([f"viewer.type={self.viewer}"] if self.viewer is not None else []), *self.overrides)
+
+    def _excite(self, robot: str) -> Path:
+        """Move the robot, and record it; returns the folder of the dataset.
+
+        Raises:
+            SystemExit: if the motion is not done.
+        """
         registry = installed_plugins()
         path = find_config(robot, registry)
-        config = load_config(path, overrides=self.overrides, sim=self.sim)
+        config = load_config(path, overrides=self._changes, sim=self.sim)
         made = () if config.recording is not None else (
             f"recording={{type: {registry.default('recorder')}, root: episodes, topics: contract}}",
         )  # fmt: skip
@@ -136,10 +147,19 @@ class Identify(IdentifyOptions):
         with tempfile.TemporaryDirectory(prefix="ibrobot-excitation-") as folder:
             file = Path(folder) / "excitation.yaml"
             file.write_text(dump_yaml(task), encoding="utf-8")
-            run(
+            changes = (*made, *plainly(config), *self.overrides, named)
+            perform = run(
                 file=str(file), config=str(path), sim=self.sim, lockstep=self.lockstep, headless=self.headless,
-                overrides=(*made, *plainly(config), *self.overrides, named),
-            )()  # fmt: skip
+                viewer=self.viewer, overrides=changes,
+            )  # fmt: skip
+            try:
+                perform()
+            except SystemExit as end:
+                if end.code:
+                    raise
+        recording = load_config(path, overrides=(*self._changes, *made, named), sim=self.sim).recording
+        assert recording is not None
+        return recording.folder
 
 
 def _named(name: str, overrides: tuple[str, ...]) -> RobotConfig:

@@ -46,13 +46,19 @@ class IdentifyOptions:
         help="calibration for such a dataset, if its unit needs one",
     )  # fmt: skip
     excite: str | None = option(
-        None, typed="--excite ROBOT", names="robot", label=None,
-        help="instead: move this robot so that all can be found, within its limits and guard, and record it",
+        None, typed="--excite ROBOT", names="robot", label="Or move a robot",
+        help="instead: move this robot so that all can be found, within its limits and guard, and record it; it needs "
+        "free space around it, and nothing in its gripper",
     )  # fmt: skip
-    minutes: float = option(5.0, ge=0.5, le=15, unit="min", label=None, help="with --excite, about how long")
-    dataset: str = option("excitation", label=None, help="with --excite, name of the dataset that is recorded")
-    sim: bool = option(False, label=None, help="with --excite, use the simulation section instead of hardware")
+    minutes: float = option(
+        5.0, ge=0.5, le=15, unit="min", label="Duration", more=True, help="about how long the motion takes"
+    )
+    dataset: str = option("excitation", label="Dataset", more=True, help="dataset into which the motion is recorded")
+    sim: bool = option(False, label="Simulated", help="move the simulated robot in place of the real one")
     lockstep: bool = option(False, label=None, help="with --excite --sim, run in simulated time")
+    viewer: str | None = option(
+        None, typed="--viewer TYPE", names="viewer", label=None, help="with --excite, show the robot in it"
+    )
     headless: bool = option(False, label=None, help="with --excite, print plain lines, without window and panel")
     seed: int = option(0, label=None, help="with --excite, of the poses")
     overrides: tuple[str, ...] = option((), typed="--set PATH=VALUE", label=None, help="e.g. simulation.timestep=0.001")
@@ -82,4 +88,15 @@ class IdentifyReport(Event):
         return Shown("; ".join(self.lines[:3]), 1.0, made={KIND: self.out} if self.out else {})
 
 
-EVENTS = (IdentifyProgress, IdentifyReport)
+@attrs.frozen(kw_only=True)
+class Excited(Event):
+    """The robot has moved, and was recorded."""
+
+    dataset: str = option(help="folder of the recording")
+
+    @override
+    def shown(self) -> Shown:
+        return Shown(f"{self.dataset}: recorded; now identify from it", 1.0, made={"episodes": self.dataset})
+
+
+EVENTS = (IdentifyProgress, Excited, IdentifyReport)

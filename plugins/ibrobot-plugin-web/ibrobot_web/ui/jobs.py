@@ -11,11 +11,12 @@ from ibrobot_provenance.asking import Answer, Ask, read_event
 from ibrobot_provenance.processes import Reader, arguments
 
 from ibrobot_core.api import IbrobotError, option
-from ibrobot_core.app import Command, Failed, WireError, installed_plugins
+from ibrobot_core.app import Command, Failed, WireError, fields, installed_plugins
 from ibrobot_web.pictures import Picture
 from ibrobot_web.ui.context import Routes, Ui
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.forms import form_of, in_page_words, job_commands, read_form, title_of
+from ibrobot_web.ui.robots import read_address
 
 _POINTS = 400
 """Points of a curve that are kept."""
@@ -34,9 +35,14 @@ def start(ui: Ui, command: str, values: Mapping[str, Any]) -> dict[str, int]:
     declared = installed_plugins().command(command)
     options = read_form(ui, declared, values)
     what = ", ".join(ui.folders.name(each) for each in _paths(options))
+    # A command that may run a robot shows it on a page, which can stop it.
+    viewed = any(each.metadata["names"] == "viewer" for each in fields(declared.options).values())
+    read_event = event_reader(ui.folders, declared)
     job = ui.jobs.start(
-        command, f"{title_of(command)} {what}", [command, "--events", *arguments(options)],
-        read=event_reader(ui.folders, declared), asks=Ask in declared.events,
+        command, f"{title_of(command)} {what}",
+        [command, "--events", *(ui.run_options if viewed else ()), *arguments(options)],
+        read=lambda line: event if (event := read_event(line)) is not None else read_address(line),
+        asks=Ask in declared.events,
     )  # fmt: skip
     return {"number": job.number}
 

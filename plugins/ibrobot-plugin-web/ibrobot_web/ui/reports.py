@@ -22,6 +22,7 @@ from ibrobot_web.ui.context import File, Routes, Ui
 from ibrobot_web.ui.recordings import find_recordings
 
 _VIDEO = ".mp4"
+_PICTURES = {".png": "image/png", ".jpg": "image/jpeg"}
 
 
 def _kind(name: str) -> ReportDescriptor:
@@ -73,7 +74,8 @@ def _block(ui: Ui, block: Text | Table | Plots | Cases) -> dict[str, Any]:
 def _case(ui: Ui, case: Case) -> dict[str, Any]:
     return {
         "title": case.title, "text": case.text, "command": case.command, "episode": _name(ui, case.episode),
-        "video": _name(ui, case.video), "at_s": case.at_s, "fixes": [attrs.asdict(each) for each in case.fixes],
+        "video": _name(ui, case.video), "picture": _name(ui, case.picture), "at_s": case.at_s,
+        "fixes": [attrs.asdict(each) for each in case.fixes],
     }  # fmt: skip
 
 
@@ -95,8 +97,17 @@ def video(ui: Ui, path: str) -> File:
     return File(file, "video/mp4")
 
 
+def picture(ui: Ui, path: str, n: int = 0) -> File:
+    """A picture; another number `n` keeps browsers from showing one that was replaced since."""
+    file = ui.folders.find(path)
+    if file.suffix not in _PICTURES or not file.is_file():
+        raise IbrobotError(f"{ui.folders.name(file)}: there is no such picture")
+    return File(file, _PICTURES[file.suffix])
+
+
 ROUTES: Routes = {
     "GET /list": listing,
     "GET /show": show,
     "GET /video": video,
+    "GET /picture": picture,
 }
