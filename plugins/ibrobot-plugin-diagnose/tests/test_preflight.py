@@ -7,6 +7,8 @@ import re
 
 import pytest
 from command_line import run_here
+from ibrobot_diagnose.pictures import read_png
+from ibrobot_diagnose.preflight_contents import lines_of, read_contents
 
 from ibrobot_core.app import installed_plugins
 
@@ -86,6 +88,13 @@ def test_camera_that_moved_fails_with_a_report(reference, tmp_path):
     assert "warns from 3, fails from 5" in first
     assert "What to do: Put the camera back" in done.stdout
     assert last.startswith("so101 is not fit to be used: 1 fail, 0 warn")
+    (sections, pictures, *_) = read_contents(tmp_path)
+    assert any("What to do: Put the camera back" in each.text for each in sections.blocks)
+    shown = pictures.blocks[0].cases
+    assert [each.title for each in shown] == ["top now", "top in the reference"]
+    assert all(read_png(each.picture.read_bytes()).shape[2] == 3 for each in shown)
+    (first_line,) = lines_of(tmp_path)
+    assert first_line == last
     page = (tmp_path / "report.html").read_text()
     assert page.count("<img") == 2
     assert "top in the reference" in page
@@ -107,6 +116,16 @@ def test_events_tell_what_is_done(reference):
     assert [each["event"] for each in events][-1] == "preflightreport"
     assert events[-1]["verdict"] == "ok"
     assert {"control", "the window"} <= {each["what"] for each in events[:-1]}
+
+
+def test_events_tell_each_difference_with_its_number_and_remedy(reference, tmp_path):
+    other = changed(reference, tmp_path / "other.json", lambda rig: rig.update(robot="koch"))
+    done = run_here("preflight", *SIM, "--against", other, "--events")
+    events = [json.loads(line) for line in done.stdout.splitlines()]
+    (differs,) = [each for each in events if each["event"] == "difference"]
+    assert (differs["name"], differs["verdict"]) == ("other_robot", "warn")
+    assert differs["limits"] == "[1 differences; warns from 1, fails from 2]"
+    assert differs["remedy"].startswith("Compare with a reference of this robot")
 
 
 @pytest.mark.parametrize(

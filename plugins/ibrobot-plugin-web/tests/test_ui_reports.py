@@ -32,7 +32,16 @@ def taste(folder: Path) -> list[ReportSection]:
     if "spilt" in (folder / FILE).read_text():
         raise IbrobotError(f"{folder / FILE}: is spilt")
     cases = [
-        Case("cup 1", "cold", folder / "one", folder / "one.mp4", "brew --cup 1", 1.5, (Fix("Drop", "delete"),)),
+        Case(
+            "cup 1",
+            "cold",
+            folder / "one",
+            folder / "one.mp4",
+            "brew --cup 1",
+            1.5,
+            (Fix("Drop", "delete"),),
+            folder / "cup.png",
+        ),
         Case("cup 2", "gone", folder / "two", folder / "link.mp4"),
         Case("cup 3", "never filled", folder / "set:2"),
     ]
@@ -60,6 +69,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (opened / "good/one").mkdir()
     (opened / "good/set").mkdir()
     (opened / "good/one.mp4").write_bytes(bytes(range(100)))
+    (opened / "good/cup.png").write_bytes(b"cup")
     (tmp_path / "secret.mp4").write_bytes(b"secret")
     (opened / "good/link.mp4").symlink_to(tmp_path / "secret.mp4")
     return opened
@@ -81,16 +91,27 @@ def test_reports_are_listed_and_shown(folder: Path) -> None:
                 "command": "brew --cup 1",
                 "episode": "good/one",
                 "video": "good/one.mp4",
+                "picture": "good/cup.png",
                 "at_s": 1.5,
                 "fixes": [{"label": "Drop", "does": "delete", "outcome": "", "begin_s": 0.0, "end_s": 0.0}],
             },
-            {"title": "cup 2", "text": "gone", "command": "", "episode": "", "video": "", "at_s": 0.0, "fixes": []},
+            {
+                "title": "cup 2",
+                "text": "gone",
+                "command": "",
+                "episode": "",
+                "video": "",
+                "picture": "",
+                "at_s": 0.0,
+                "fixes": [],
+            },
             {
                 "title": "cup 3",
                 "text": "never filled",
                 "command": "",
                 "episode": "good/set:2",
                 "video": "",
+                "picture": "",
                 "at_s": 0.0,
                 "fixes": [],
             },
@@ -110,6 +131,9 @@ def test_wrong_requests_for_reports_are_errors(folder: Path) -> None:
             ("video", {"path": "../secret.mp4"}, "outside the opened folders"),
             ("video", {"path": f"good/{FILE}"}, "there is no such video"),
             ("video", {"path": "good/three.mp4"}, "there is no such video"),
+            ("picture", {"path": "good/one.mp4"}, "there is no such picture"),
+            ("picture", {"path": "good/none.png"}, "there is no such picture"),
+            ("picture", {"path": "../secret.png"}, "outside the opened folders"),
         )
         for request, query, error in wrong:
             with pytest.raises(RuntimeError, match=error):
@@ -133,3 +157,12 @@ def test_page_colours_all_classes_of_plots() -> None:
     assert set(re.findall(r"\.plotted \.([\w-]+) \{", style)) == set(PLOT_CLASSES)
     for stroke in ("range", "estimate", "margin", "bad"):  # the page takes shapes without their attribute `fill`
         assert re.search(rf"\.plotted \.{stroke} \{{[^}}]*fill: none;", style), stroke
+
+
+def test_a_picture_of_a_report_is_served(folder: Path) -> None:
+    async def test(server: UiServer) -> None:
+        async with server.client.get("/api/reports/picture?path=good/cup.png") as answer:
+            assert (answer.status, answer.content_type, await answer.read()) == (200, "image/png", b"cup")
+            assert answer.headers["Cache-Control"] == "no-store"
+
+    run_ui([folder], test)

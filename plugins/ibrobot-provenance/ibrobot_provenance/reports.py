@@ -71,14 +71,14 @@ class Case:
     episode: Path | None
     """Its recording; None if there is none."""
     video: Path | None = None
-    picture: Path | None = None
-    """A PNG or JPEG file."""
     command: str = ""
     """The command that repeats it."""
     at_s: float = 0.0
     """Where to begin to play the recording [s]."""
     fixes: tuple[Fix, ...] = ()
     """What can be done to the recording, the likeliest first."""
+    picture: Path | None = None
+    """A PNG or JPEG file."""
 
 
 @attrs.frozen

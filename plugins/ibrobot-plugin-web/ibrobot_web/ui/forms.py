@@ -28,7 +28,7 @@ from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.recordings import Episodes, find_policies, find_recordings
 from ibrobot_web.ui.robots import robot_names, robot_of
 
-_FLAG = re.compile(r"(?<![\w.])(?P<flag>--[a-z][a-z-]*)(?![\w.-])(?: (?P<value>[\w-]+))?")
+_FLAG = re.compile(r"(?<![\w.])(?P<tick>`?)(?P<flag>--[a-z][a-z-]*)(?![\w.-])(?: (?P<value>[\w-]+))?(?P=tick)")
 _COMMAND = re.compile(r"`ibrobot ([a-z]+(?: [a-z]+)?)[^`]*`")
 _COMMAND_S = 600.0
 _TITLES = {"eval": "Evaluate"}

@@ -34,7 +34,7 @@ def start(ui: Ui, command: str, values: Mapping[str, Any]) -> dict[str, int]:
         raise IbrobotError(f"{command[:40]!r} is no job; the jobs are: {', '.join(job_commands())}")
     declared = installed_plugins().command(command)
     options = read_form(ui, declared, values)
-    what = ", ".join(ui.folders.name(each) for each in _paths(options))
+    what = ", ".join([*_robots(ui, options), *(ui.folders.name(each) for each in _paths(options))])
     # A command that may run a robot shows it on a page, which can stop it.
     viewed = any(each.metadata["names"] == "viewer" for each in fields(declared.options).values())
     read_event = event_reader(ui.folders, declared)
@@ -45,6 +45,14 @@ def start(ui: Ui, command: str, values: Mapping[str, Any]) -> dict[str, int]:
         asks=Ask in declared.events,
     )  # fmt: skip
     return {"number": job.number}
+
+
+def _robots(ui: Ui, options: Any) -> list[str]:
+    """The robots in options, as the page calls them."""
+    named = [
+        getattr(options, name) for name, each in fields(type(options)).items() if each.metadata["names"] == "robot"
+    ]
+    return [ui.folders.name(Path(each)) for each in named if isinstance(each, str)]
 
 
 def _paths(options: Any) -> list[Path]:

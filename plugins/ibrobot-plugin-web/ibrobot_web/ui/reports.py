@@ -97,8 +97,8 @@ def video(ui: Ui, path: str) -> File:
     return File(file, "video/mp4")
 
 
-def picture(ui: Ui, path: str, n: int = 0) -> File:
-    """A picture; another number `n` keeps browsers from showing one that was replaced since."""
+def picture(ui: Ui, path: str) -> File:
+    """A picture."""
     file = ui.folders.find(path)
     if file.suffix not in _PICTURES or not file.is_file():
         raise IbrobotError(f"{ui.folders.name(file)}: there is no such picture")

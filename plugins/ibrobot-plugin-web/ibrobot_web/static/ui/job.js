@@ -106,6 +106,7 @@ function failure(job) {
   if (job.facts.error) return [problem(job.facts.error)];
   if (job.exit_code < 0) return [problem(`It was killed by signal ${-job.exit_code}. Its last lines are in its output.`)];
   const errors = job.lines.filter((line) => line.startsWith("error: "));
+  if (!errors.length && job.facts.problems?.length) return []; // they are the result, and are shown
   const text = errors.length ? errors.map((line) => line.slice("error: ".length)) : job.lines.slice(-8);
   return [problem([`exit code ${job.exit_code}`, ...text].join("\n"))];
 }

@@ -78,7 +78,6 @@ export class View {
     }
     if (this.path !== path) return; // another one was opened meanwhile
     this.sections = sections;
-    this.opened = Date.now();
     this.draw();
   }
 
@@ -102,7 +101,7 @@ export class View {
     const { title, text, episode, video, picture: shown, command, at_s: at } = each;
     return h("article", { class: "case" }, h("h4", {}, title),
       video ? h("video", { src: `${this.ui.address("reports/video", { path: video })}#t=0.01`, controls: true, muted: true, preload: "metadata", "aria-label": `Video of ${title}` }) : null,
-      shown ? h("img", { src: this.ui.address("reports/picture", { path: shown, n: this.opened }), alt: title }) : null,
+      shown ? h("img", { src: this.ui.address("reports/picture", { path: shown }), alt: title }) : null,
       text ? h("p", {}, text) : null,
       episode ? h("p", {}, h("a", { href: `#episodes/${encodeURIComponent(episode)}` }, episode)) : null,
       command ? h("code", {}, command) : null,
