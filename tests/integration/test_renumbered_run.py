@@ -39,9 +39,9 @@ ARMS = {"FOLLOWER": 2050, "LEADER": 2150}
 """Serial number of an adapter -> where all servos of its arm stand [ticks]."""
 CAMERAS = {"top": "pci-0000:00:14.0-usb-0:1:1.0", "wrist": "pci-0000:00:14.0-usb-0:2:1.0", "side": "usb-HD_Cam_0042"}
 """Camera -> its name by the USB port, or by its serial number."""
-BOOT = {"FOLLOWER": "ttyACM0", "LEADER": "ttyACM1", "top": 0, "wrist": 2, "side": 4}
-REBOOT = {"FOLLOWER": "ttyACM2", "LEADER": "ttyACM0", "top": 4, "wrist": 0, "side": 2}
-EXCHANGED = {**BOOT, "FOLLOWER": "ttyACM1", "LEADER": "ttyACM0"}
+BOOT: Mapping[str, str | int] = {"FOLLOWER": "ttyACM0", "LEADER": "ttyACM1", "top": 0, "wrist": 2, "side": 4}
+REBOOT: Mapping[str, str | int] = {"FOLLOWER": "ttyACM2", "LEADER": "ttyACM0", "top": 4, "wrist": 0, "side": 2}
+EXCHANGED: Mapping[str, str | int] = {**BOOT, "FOLLOWER": "ttyACM1", "LEADER": "ttyACM0"}
 """Device -> its number."""
 PATIENCE_S = 90.0
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

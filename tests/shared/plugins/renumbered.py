@@ -27,9 +27,10 @@ class Node:
     """What OpenCV opens of a V4L2 device: a still picture, 20 times a second."""
 
     def __init__(self, node: Path) -> None:
-        self._picture = cv2.imread(str(BENCH / f"{node.read_text(encoding='utf-8')}.png"))
-        assert self._picture is not None
-        height, width = self._picture.shape[:2]
+        picture = cv2.imread(str(BENCH / f"{node.read_text(encoding='utf-8')}.png"))
+        assert picture is not None
+        self._picture = picture
+        height, width = picture.shape[:2]
         self._properties = {
             cv2.CAP_PROP_FRAME_WIDTH: float(width), cv2.CAP_PROP_FRAME_HEIGHT: float(height),
             cv2.CAP_PROP_FPS: 1 / _PERIOD_S,
