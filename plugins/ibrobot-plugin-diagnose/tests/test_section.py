@@ -73,10 +73,14 @@ def test_hardware_is_compared_if_its_dataset_or_checkpoint_has_a_reference(confi
     assert reference_for(policy) == checkpoint / "reference.json"
 
 
+FEW = [part for camera in ("top", "wrist") for part in ("--set", f"peripherals.{camera}.fps=10")]
+"""A third of the pictures, which take most of the time."""
+
+
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory):
     file = tmp_path_factory.mktemp("rig") / "rig.json"
-    assert run_here("preflight", "so101", "--sim", "--lockstep", "--seconds", 0.5, "--take", file).returncode == 0
+    assert run_here("preflight", "so101", "--sim", "--lockstep", "--seconds", 0.5, "--take", file, *FEW).returncode == 0
     return file
 
 
@@ -85,24 +89,24 @@ MOVED = ("--set", "simulation.scene={type: pick_cube, camera_turn: [0.02, 0.02]}
 
 def launch(section, *arguments):
     options = ("--sim", "--headless", "--duration", 0.1, "--set", f"preflight={json.dumps(section)}", *arguments)
-    return run_here("launch", "so101", *options)
+    return run_here("launch", "so101", *options, *FEW)
 
 
 @needs_simulation
 @pytest.mark.integration
 def test_run_of_a_rig_that_differs_is_refused_or_warned_of(reference):
     told = {"against": str(reference), "seconds": 0.5}
-    refused = launch({**told, "action": "refuse"}, *MOVED)
+    refused = launch({**told, "action": "refuse"}, *MOVED)  # in real time; the others step
     assert refused.returncode == 1
     assert "error: preflight: The camera top has moved" in refused.stderr
     assert "Put the camera back" in refused.stderr
-    warned = launch(told, *MOVED)
+    warned = launch(told, *MOVED, "--lockstep")
     assert warned.returncode == 0
     assert "W preflight: FAIL  camera_moved: The camera top has moved" in warned.stderr
     stepped = launch({**told, "action": "refuse"}, *MOVED, "--lockstep")
     assert stepped.returncode == 1
     assert "error: preflight: The camera top has moved" in stepped.stderr
-    off = launch({**told, "action": "off"}, *MOVED)
+    off = launch({**told, "action": "off"}, *MOVED, "--lockstep")
     assert (off.returncode, "camera_moved" in off.stderr) == (0, False)
 
 
@@ -118,18 +122,18 @@ def test_run_of_a_rig_that_is_as_it_was_begins(reference):
 @pytest.mark.integration
 def test_first_recording_takes_the_reference(tmp_path):
     section = ("--set", "preflight={seconds: 0.5}")
-    options = ("--sim", "--headless", "--auto", "--duration", 0.1, "--root", tmp_path, *section)
+    options = ("--sim", "--headless", "--auto", "--duration", 0.1, "--root", tmp_path, *section, *FEW)
     first = run_here("record", "so101", *options)
     assert f"took the reference {tmp_path / 'default' / 'rig.json'}" in first.stderr
-    second = run_here("record", "so101", *options, *MOVED)
+    second = run_here("record", "so101", *options, *MOVED, "--lockstep")
     assert "W preflight: FAIL  camera_moved" in second.stderr
-    again = run_here("preflight", "so101", "--sim", "--lockstep", "--against", tmp_path / "default", "--json")
+    again = run_here("preflight", "so101", "--sim", "--lockstep", "--against", tmp_path / "default", "--json", *FEW)
     assert json.loads(again.stdout)["verdict"] == "ok"
 
 
 @needs_simulation
 @pytest.mark.integration
 def test_reference_that_is_missing_is_named(tmp_path):
-    done = launch({"against": str(tmp_path / "nowhere.json")})
+    done = launch({"against": str(tmp_path / "nowhere.json")}, "--lockstep")
     assert done.returncode == 1
     assert "nowhere.json: there is no such reference, dataset or checkpoint" in done.stderr
