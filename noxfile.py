@@ -382,7 +382,7 @@ def docs(session: nox.Session) -> None:
     install(session, *PLUGINS, groups=("docs", "test"))
     build = ("sphinx-build", "-q", "-W", "--keep-going", "-n", "-d", "docs/_build/doctrees")  # read once for both
     session.run(*build, "-b", "html", "docs", "docs/_build/html")
-    session.run(*build, "-b", "doctest", "docs", "docs/_build/doctest")
+    session.run(*build, "-t", "read", "-b", "doctest", "docs", "docs/_build/doctest")
     session.log(f"the site is at {Path('docs/_build/html/index.html').absolute().as_uri()}")
 
 

@@ -101,7 +101,8 @@ def _drop_plain_bases(app: Sphinx, domain: str, kind: str, content: Element) -> 
 
 def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
-    site_pages.connect(app, generate.PAGES)
+    site_pages.connect(app, generate.PAGES, are_read="read" in app.tags)
+    site_pages.copy_titles_alone(app)
     app.connect("autodoc-process-docstring", _require_docstring, priority=300)
     app.connect("autodoc-process-docstring", _keep_colons, priority=400)
     app.connect("autodoc-process-docstring", _types_beside_names, priority=600)
