@@ -54,8 +54,15 @@ class SlowLink:
             for each in (up, down):
                 each.cancel()
             await asyncio.gather(up, down, return_exceptions=True)
-            writer.close()
-            far_writer.close()
+            for end in (writer, far_writer):
+                end.close()
+                with contextlib.suppress(OSError):
+                    await end.wait_closed()
+            self._tasks.discard(task)
+
+    async def emptied(self) -> None:
+        """Wait until nobody is connected any more."""
+        await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, limited: bool) -> None:
         loop = asyncio.get_running_loop()
