@@ -49,6 +49,8 @@ KINDS = {
     "vqbet": CONFIGS["vqbet"],
 }
 """Each sees pictures."""
+_DURATION_S = {"blind": 2}
+"""Of its run, if it takes more than 15 answers to judge it [s]."""
 
 
 def robot(path: Path) -> Path:
@@ -90,7 +92,8 @@ def record(root: Path, kind: str, mode: str, endpoint: str = "") -> Path:
     network = ("--set", f"transport={{type: zenoh, connect: [{endpoint}]}}") if endpoint else ()
     done = run_here(
         "launch", robot(root / "cube.yaml"), "--sim", "--headless", "--lockstep", "--episodes", 1,
-        "--mode", "learned", "--set", "contract.max_duration_s=2", "--set", "models.act.threads=1",
+        "--mode", "learned", "--set", f"contract.max_duration_s={_DURATION_S.get(kind, 0.5)}",
+        "--set", "models.act.threads=1",
         "--set", f"models.act.path={checkpoint}", "--set", f"recording.root={root / kind}-{mode}",
         "--set", "recording.type=mcap",
         "--set", f"control_modes.learned.inference.execution_mode={mode}", *network,
