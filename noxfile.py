@@ -218,7 +218,7 @@ def marked(mark: str) -> list[str]:
 
 @nox.session
 def integration(session: nox.Session) -> None:
-    """What needs every plugin, or starts processes."""
+    """What needs several plugins, or starts `ibrobot`."""
     install(session, *PLUGINS, groups=("test", "browser", "agents", "examples"))
     system_libraries(session)
     chromium(session)

@@ -49,7 +49,6 @@ def listen(child: Child) -> None:
         child.wait(PATIENCE_S)
 
 
-@pytest.mark.integration
 class TestChild:
     def test_messages_come_back_and_log_records_go_to_the_log_of_the_parent(self, start, caplog):
         child = start(log="the arm is warm", say=[{"event": "ready"}, {"event": "report"}])

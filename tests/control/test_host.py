@@ -75,7 +75,7 @@ def list_of(waiting: queue.SimpleQueue[Any]) -> list[Any]:
     return found
 
 
-@pytest.fixture(params=[pytest.param("process", marks=pytest.mark.integration), "inline"])
+@pytest.fixture(params=["process", "inline"])
 def kind(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
@@ -189,7 +189,6 @@ class TestBoth:
             host.call(SwitchMode(mode="dance"))
 
 
-@pytest.mark.integration
 class TestProcess:
     def test_states_come_in_order_and_plans_are_followed(self, make, reports):
         host = make()
