@@ -100,8 +100,9 @@ def test_snapshot_refuses_what_it_cannot_write() -> None:
 def test_preview_shows_the_stream_to_who_has_the_token() -> None:
     with StreamServer() as server:
         command = (*ibrobot_command(), "camera", "preview", server.url)
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as preview:
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as preview:
             assert preview.stdout is not None
+            assert preview.stderr is not None
             try:
                 url = preview.stdout.readline().strip()
                 browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
@@ -117,6 +118,10 @@ def test_preview_shows_the_stream_to_who_has_the_token() -> None:
                 assert received.count(b"--picture") >= 2
                 assert b"\xff\xd8" in received
                 stream.close()
+                again = browser.open(f"{address}stream/0", timeout=20)
+                assert again.read(60_000).count(b"--picture") > 2, "pictures also for the page that was closed"
+                again.close()
             finally:
                 preview.terminate()
+            assert "Traceback" not in preview.stderr.read(), "a page that is closed is no error"
         assert preview.returncode == 0

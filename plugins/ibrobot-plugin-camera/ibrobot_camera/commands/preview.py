@@ -6,7 +6,7 @@ import asyncio
 import html
 import threading
 from collections.abc import Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from typing import TYPE_CHECKING
 
 import attrs
@@ -126,11 +126,12 @@ def _app(views: Mapping[str, Newest], ended: threading.Event) -> web.Application
         view, seen = list(views.values())[number], 0
         response = web.StreamResponse(headers={"Content-Type": f"multipart/x-mixed-replace; boundary={_BOUNDARY}"})
         await response.prepare(request)
-        while not ended.is_set():
-            seen, jpeg = await asyncio.to_thread(view.after, seen, 0.5)
-            if jpeg:
-                head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
-                await response.write(head.encode() + jpeg + b"\r\n")
+        with suppress(ConnectionResetError):  # the browser has closed the page
+            while not ended.is_set():
+                seen, jpeg = await asyncio.to_thread(view.after, seen, 0.5)
+                if jpeg:
+                    head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+                    await response.write(head.encode() + jpeg + b"\r\n")
         return response
 
     app = web.Application()
