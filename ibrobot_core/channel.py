@@ -123,13 +123,12 @@ class Channel:
         Args:
             timeout_s: longest wait for bytes to arrive, for `wake`, or for the peer to read [s]; None for no limit.
         """
-        self._exchange()
         if timeout_s != 0.0 and not (self._arrived or self.closed):
             unsent = [self._socket] if self.backlog else []
             ready, _, _ = select.select([self._socket.fileno(), self._wake], unsent, [], timeout_s)
             if self._wake in ready:
                 os.read(self._wake, 4096)
-            self._exchange()
+        self._exchange()
         arrived, self._arrived = self._arrived, []
         return arrived
 
