@@ -56,6 +56,13 @@ TITLE = """async (title) => {
 }"""
 """What the card of a job with a title shows as its title."""
 
+LATER = """async () => {
+  const { words } = await import("/static/words.js");
+  for (let i = 0; i < 5000; i += 1) words(`${i / 100} rad`);
+  return words("Datasets");
+}"""
+"""A text of the table after many others were looked up, as on the page of a run."""
+
 
 @pytest.mark.integration
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
@@ -90,5 +97,6 @@ def test_no_english_sentence_is_left_in_a_chinese_browser(tmp_path: Path) -> Non
             ("Explain b", "分析失败 b"),
         ):
             assert page.evaluate(TITLE, title) == shown
+        assert page.evaluate(LATER) == "数据集"
         browser.close()
     assert errors == []

@@ -8,7 +8,8 @@ if (language) document.documentElement.lang = language;
 // Those that are filled in, the longest first: it says most.
 const filled = Object.entries(table).filter(([text]) => text.includes("{}")).sort(([a], [b]) => b.length - a.length)
   .map(([text, words]) => [new RegExp(`^${text.split("{}").map((part) => part.replace(/[.*+?^${}()|[\]\\]/g, "\\$&")).join("(.+?)")}$`), words]);
-const known = new Map(Object.entries(table)); // with what was looked up before
+const known = new Map(Object.entries(table));
+const before = new Map(); // what was looked up
 const MOST = 2000;
 
 // A text in the language of the browser; what no table has stays as it is.
@@ -19,7 +20,7 @@ export function words(text) {
 }
 
 function lookUp(text) {
-  let found = known.get(text);
+  let found = known.get(text) ?? before.get(text);
   if (found === undefined) {
     found = text;
     for (const [pattern, template] of filled) {
@@ -29,8 +30,8 @@ function lookUp(text) {
       found = template.replaceAll("{}", () => words(match[++i]));
       break;
     }
-    if (known.size > MOST) known.clear();
-    known.set(text, found);
+    if (before.size > MOST) before.clear();
+    before.set(text, found);
   }
   return found;
 }
