@@ -218,7 +218,7 @@ def marked(mark: str) -> list[str]:
 
 @nox.session
 def integration(session: nox.Session) -> None:
-    """What needs several plugins, or starts `ibrobot`."""
+    """What needs several plugins."""
     install(session, *PLUGINS, groups=("test", "browser", "agents", "examples"))
     system_libraries(session)
     chromium(session)

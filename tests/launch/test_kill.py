@@ -17,8 +17,6 @@ from logged_run import PATIENCE_S, Run, errors_in, is_alive, logged_runs, wait_f
 if TYPE_CHECKING:
     from ibrobot_testing.site import Site
 
-pytestmark = pytest.mark.integration
-
 STOP_TICKS = 10
 """100 ms of the control loop. It brakes by ticks: those that a busy machine has it miss are none."""
 REST, FAR = np.array([-1.2, 1.2]), np.array([-2.7, 2.7])

@@ -22,8 +22,6 @@ from logged_run import PATIENCE_S, Run, errors_in, is_alive, logged_runs, wait_f
 if TYPE_CHECKING:
     from ibrobot_testing.site import Site
 
-pytestmark = pytest.mark.integration
-
 LIMIT_S = 1.0
 """Longest motion after an event: `peer_timeout`, 0.3 s, and as much again for a busy machine."""
 
