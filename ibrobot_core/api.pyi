@@ -62,6 +62,7 @@ from ibrobot_core.interfaces.hardware import (
     Severity as Severity,
     nan_vector as nan_vector,
 )
+from ibrobot_core.contract.vectors import ACTION as ACTION
 from ibrobot_core.deadman import Deadman as Deadman
 
 # Models
@@ -137,6 +138,8 @@ from ibrobot_core.errors import (
 
 # Messages
 from ibrobot_core.messages import (
+    DIAGNOSTICS as DIAGNOSTICS,
+    JOINT_STATES as JOINT_STATES,
     Message as Message,
     MESSAGE_TYPES as MESSAGE_TYPES,
     Header as Header,

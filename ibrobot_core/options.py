@@ -51,12 +51,30 @@ _BOUNDS: Mapping[str, tuple[Callable[[Any, Any], bool], str]] = {
 }
 
 
+@attrs.frozen
+class OptionWords:
+    """What forms and command lines make of an option."""
+
+    label: str | None = ""
+    """What forms and their errors call it; the key by default. None: it is for terminals, and not in forms."""
+    more: bool = False
+    """Whether forms show it among further options."""
+    names: str = ""
+    """What a text or path names: `episodes`, `dataset`, `policy`, `robot`, `calibration`, `viewer`, or the `options` of
+    another program."""
+    suggest: str = ""
+    """A value that forms enter, e.g. `datasets/{episodes}`: a name in braces stands for the last part of the path given
+    for the option of this name. Of several choices, the one that forms tick."""
+    typed: str = ""
+    """What a command line calls it, if that is not made of the key: flags and value, e.g. `-o FILE`, or an argument,
+    e.g. `EPISODES`. A value `[HZ=40]` may be left out."""
+
+
 def option(
     default: Any = attrs.NOTHING, *, unit: str = "", help: str = "", ge: float | None = None, gt: float | None = None,
     le: float | None = None, lt: float | None = None, choices: Sequence[Any] | Mapping[str, str] | None = None,
     open: bool = False, factory: Any = None, validator: Any = None, secret: bool = False, key: str | None = None,
-    plain: Any = None, label: str | None = "", more: bool = False, names: str = "", suggest: str = "",
-    typed: str = "",
+    plain: Any = None, **words: Any,
 ) -> Any:  # fmt: skip
     """An attrs field for an options class.
 
@@ -75,20 +93,13 @@ def option(
         secret: whether to hide the value; recordings and `config show` contain `${NAME}` as in the YAML, else `***`.
         key: the key in the YAML, if it differs from the field's name.
         plain: type of the value in files and requests, if programs may set others as well.
-        label: what forms and their errors call it; the key by default. None: it is for terminals, and not in forms.
-        more: whether forms show it among further options.
-        names: what a text or path names: `episodes`, `dataset`, `policy`, `robot`, `calibration`, `viewer`, or the
-            `options` of another program.
-        suggest: a value that forms enter, e.g. `datasets/{episodes}`: a name in braces stands for the last part of the
-            path that is given for the option of this name. Of several choices, the one that forms tick.
-        typed: what a command line calls it, if that is not made of the key: flags and value, e.g. `-o FILE`, or an
-            argument, e.g. `EPISODES`. A value `[HZ=40]` may be left out.
+        words: fields of `OptionWords`.
     """
     bounds = {"ge": ge, "gt": gt, "le": le, "lt": lt}
-    metadata: dict[str, Any] = {"unit": unit, "help": help, "suggest": suggest, **bounds}
+    metadata: dict[str, Any] = {"unit": unit, "help": help, **bounds, **attrs.asdict(OptionWords(**words))}
     metadata["choices"] = tuple(choices) if choices is not None else None
-    metadata |= {"secret": secret, "plain": plain, "label": label, "more": more, "names": names, "typed": typed}
-    metadata |= {"open": open, "words": dict(choices) if isinstance(choices, Mapping) else {}}
+    metadata |= {"secret": secret, "plain": plain, "open": open}
+    metadata["words"] = dict(choices) if isinstance(choices, Mapping) else {}
     shown: Any = _hidden if secret else True
 
     def check(instance: Any, attribute: attrs.Attribute[Any], value: Any) -> None:

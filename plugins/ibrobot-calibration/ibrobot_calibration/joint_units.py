@@ -11,11 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_calibration.calibration import JointCalibration, load_calibration
-from ibrobot_core.api import CalibrationError, Contract, Frame, JointState
+from ibrobot_core.api import ACTION, CalibrationError, Contract, Frame, JointState
 from ibrobot_core.app import PolicyVectors, RobotConfig, installed_plugins
 
-ACTION = "action"
-"""Key of the action vector."""
 LEROBOT_MODES = ("range_m100_100", "range_0_100", "degrees")
 """LeRobot's units of joint positions, named as in its `MotorNormMode`."""
 _CLOSED_MODE = "range_0_100"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import override
 
-from ibrobot_core.api import JointState, String, TFMessage
+from ibrobot_core.api import JOINT_STATES, JointState, String, TFMessage
 from ibrobot_core.app import CONTROL, RunView, SessionWorker
 from ibrobot_kinematics.errors import KinematicsError
 from ibrobot_kinematics.frames import mounted, transform
@@ -47,7 +47,7 @@ class DescriptionPublisher(SessionWorker):
         for topic, path in files.items():
             if path is not None:
                 session.bus.publish(topic, String(_text(path)), latched=True)
-        self._states = session.bus.subscribe("/joint_states", 1)
+        self._states = session.bus.subscribe(JOINT_STATES, 1)
         self.on_end.callback(self._states.close)
 
     @override

@@ -10,12 +10,10 @@ import numpy as np
 from ibrobot_calibration.joint_units import JointUnits
 from numpy.typing import NDArray
 
-from ibrobot_core.api import ActionPart, Contract, ContractError, Frame, JointState, PolicySpec, Vector
+from ibrobot_core.api import ACTION, ActionPart, Contract, ContractError, Frame, JointState, PolicySpec, Vector
 from ibrobot_kinematics.delta_features import Deltas, Positions
 from ibrobot_kinematics.feature import ActionFeature
 from ibrobot_kinematics.tool_features import PREFIX, Piece, action_features
-
-_ACTION = "action"
 
 
 @attrs.frozen(eq=False)
@@ -73,9 +71,9 @@ class FeatureVectors(JointUnits):
 
     @override
     def __call__(self, values: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        converted = super().__call__({key: value for key, value in values.items() if key != _ACTION})
-        if _ACTION in values:
-            converted[_ACTION] = self._encoded(values, values[_ACTION])
+        converted = super().__call__({key: value for key, value in values.items() if key != ACTION})
+        if ACTION in values:
+            converted[ACTION] = self._encoded(values, values[ACTION])
         return converted
 
     @override
@@ -89,7 +87,7 @@ class FeatureVectors(JointUnits):
             raise ValueError(f"a chunk must have the shape (N, {self._size}), got {actions.shape}")
         joints = np.tile(np.asarray(start, dtype=np.float64), (len(actions), 1))
         converted = joints.copy()
-        inside = self._joint_units({_ACTION: np.asarray(start, dtype=np.float64)})[_ACTION]
+        inside = self._joint_units({ACTION: np.asarray(start, dtype=np.float64)})[ACTION]
         held = 0
         for part in self._parts:
             feature = part.feature
@@ -99,7 +97,7 @@ class FeatureVectors(JointUnits):
             )
             held += missed
             (converted if feature.in_units else joints)[:, part.joints] = positions
-        in_radians = self._joint_units.radians(_ACTION, converted)
+        in_radians = self._joint_units.radians(ACTION, converted)
         for part in self._parts:
             if part.feature.in_units:
                 joints[:, part.joints] = in_radians[:, part.joints]
@@ -118,7 +116,7 @@ class FeatureVectors(JointUnits):
     def _encoded(self, values: Mapping[str, NDArray[Any]], joints: NDArray[Any]) -> NDArray[Any]:
         """The policy's numbers, shape (…, F), for positions of the joints [rad], shape (…, A)."""
         exact = joints.astype(np.float64)
-        inside = self._joint_units({_ACTION: exact})[_ACTION]
+        inside = self._joint_units({ACTION: exact})[ACTION]
         numbers = np.empty((*joints.shape[:-1], self._size))
         for part in self._parts:
             given = (inside if part.feature.in_units else exact)[..., part.joints]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import override
 
-from ibrobot_core.api import NS_PER_S, Header, JointState, Pose, PoseStamped, Vector3
+from ibrobot_core.api import JOINT_STATES, NS_PER_S, Header, JointState, Pose, PoseStamped, Vector3
 from ibrobot_core.app import CONTROL, RunView, SessionWorker
 from ibrobot_kinematics import KinematicModel, KinematicsError, robot_model
 from ibrobot_kinematics.options import ToolPoseOptions
@@ -31,7 +31,7 @@ class ToolPose(SessionWorker):
             self.session.log.warning("%s is not published: %s", self._options.topic, error)
             return
         self._next_ns = None
-        self._states = self.session.bus.subscribe("/joint_states", 1)
+        self._states = self.session.bus.subscribe(JOINT_STATES, 1)
         self.on_end.callback(self._states.close)
 
     @override

@@ -9,6 +9,7 @@ from typing import override
 import numpy as np
 
 from ibrobot_core.api import (
+    DIAGNOSTICS,
     Context,
     DiagnosticArray,
     DiagnosticStatus,
@@ -41,7 +42,6 @@ _OVERRULED_RAD = 1e-3
 """A command that is further from all requests is another's [rad]."""
 _USED_LEAD = 0.7
 """Share of `max_lead` at which a tool with path constraints waits. Beyond it, control would hold back one joint."""
-_DIAGNOSTICS = "/diagnostics"
 _PAUSE_NS = ns(0.5)
 """A stream of twists that was silent for so long counts as released [ns]."""
 _SOON_NS = ns(0.25)
@@ -241,7 +241,7 @@ class TwistTeleop(Teleop):
             DiagnosticStatus.WARN, f"{self._ctx.name}: refused twists", f"refused a twist: {fault}", values=counts
         )
         if self._ctx.bus is not None:
-            self._ctx.bus.publish(_DIAGNOSTICS, DiagnosticArray(Header(now_ns), (status,)))
+            self._ctx.bus.publish(DIAGNOSTICS, DiagnosticArray(Header(now_ns), (status,)))
 
     def _publish_status(self, servo: Servo, now_ns: int) -> None:
         if self._published is not None:

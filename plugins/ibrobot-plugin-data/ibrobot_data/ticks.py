@@ -12,6 +12,7 @@ import attrs
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
+    ACTION,
     ActionPart,
     Contract,
     ContractError,
@@ -28,7 +29,6 @@ from ibrobot_core.api import (
 )
 from ibrobot_core.app import Align, FrameAssembler, SignalPart
 
-ACTION = "action"
 TASK_KEY = "task"
 """The key of a signal whose texts replace the prompt."""
 _LONGEST_SILENCE_S = 60

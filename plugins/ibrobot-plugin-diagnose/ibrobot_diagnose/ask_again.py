@@ -17,6 +17,7 @@ from ibrobot_calibration.joint_units import policy_units
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
+    ACTION,
     Context,
     Contract,
     Engine,
@@ -32,7 +33,6 @@ from ibrobot_core.app import FrameAssembler, RobotConfig, from_document, install
 from ibrobot_diagnose.pictures import Shown, reddened
 from ibrobot_diagnose.window import Asked, Floats, Window
 
-ACTION = "action"
 _ATTENTION = "attention."
 """Prefix of outputs that say where a model looks in a picture, of shape (h, w)."""
 _log = logging.getLogger("ibrobot.diagnose")

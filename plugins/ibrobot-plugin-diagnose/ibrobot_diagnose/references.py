@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import attrs
 from ibrobot_provenance.datasets import element_names
 
-from ibrobot_core.api import DatasetError, EpisodeAddress, Image, JointState, RecorderError
+from ibrobot_core.api import JOINT_STATES, DatasetError, EpisodeAddress, Image, JointState, RecorderError
 from ibrobot_core.app import installed_plugins
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def _given(dataset: Path, info: Mapping[str, Any]) -> dict[str, str]:
     align = {"strategy": "hold", "stamp": "header", "tol_ms": None}
     observations: dict[str, Any] = {
         "observation.state": [{
-            "topic": "/joint_states", "type": JointState.ros_type, "select": [f"position.{each}" for each in state],
+            "topic": JOINT_STATES, "type": JointState.ros_type, "select": [f"position.{each}" for each in state],
             "encoding": None, "shape": [len(state)], "align": align,
         }]
     }  # fmt: skip

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
+    ACTION,
     MESSAGE_TYPES,
     Contract,
     ContractError,
@@ -22,7 +23,6 @@ from ibrobot_core.api import (
     ObservationPart,
 )
 
-_ACTION = "action"
 _DEPTH: Mapping[str, type[np.generic]] = {"16UC1": np.uint16, "32FC1": np.float32}
 """Encoding -> element type, for encodings that are not uint8."""
 
@@ -43,12 +43,12 @@ class Composer:
         self._contract = contract
         if computed := [part for part in contract.action_parts if part.features]:
             raise ContractError(
-                f"{_ACTION}: cannot make commands from {', '.join(computed[0].features)}: the dataset lacks the "
+                f"{ACTION}: cannot make commands from {', '.join(computed[0].features)}: the dataset lacks the "
                 "positions of the joints"
             )
         if foreign := [part for part in contract.action_parts if part.select]:
             raise ContractError(
-                f"{_ACTION}: cannot make a {foreign[0].type} for {foreign[0].topic}, because the action is foreign"
+                f"{ACTION}: cannot make a {foreign[0].type} for {foreign[0].topic}, because the action is foreign"
             )
         self._topics: dict[str, list[ObservationPart]] = {}
         for part in contract.observation_parts:
@@ -62,7 +62,7 @@ class Composer:
     def keys(self, topics: Collection[str]) -> set[str]:
         """The keys whose values are needed for the messages of `topics`."""
         keys = {part.key for part in self._contract.observation_parts if part.topic in topics}
-        return keys | ({_ACTION} if any(part.topic in topics for part in self._contract.action_parts) else set())
+        return keys | ({ACTION} if any(part.topic in topics for part in self._contract.action_parts) else set())
 
     def __call__(self, values: Mapping[str, NDArray[Any]], stamp_ns: int) -> dict[str, Message]:
         """Make the messages of all topics whose keys are in `values`; returns topic -> message.
@@ -79,8 +79,8 @@ class Composer:
         for topic, parts in self._topics.items():
             if all(part.key in values for part in parts):
                 messages[topic] = self._message(parts, values, header)
-        if _ACTION in values:
-            messages |= self._action(values[_ACTION])
+        if ACTION in values:
+            messages |= self._action(values[ACTION])
         return messages
 
     def _message(self, parts: list[ObservationPart], values: Mapping[str, NDArray[Any]], header: Header) -> Message:

@@ -12,14 +12,13 @@ import attrs
 from ibrobot_ros2.calls import GoalRequest
 from ibrobot_ros2.goals import Actions, with_goals
 
-from ibrobot_core.api import DiagnosticArray, DiagnosticStatus, Header, KeyValue, NotSupported
+from ibrobot_core.api import DIAGNOSTICS, DiagnosticArray, DiagnosticStatus, Header, KeyValue, NotSupported
 from ibrobot_core.app import CONTROL, Channel, ChannelMessage, Component, ComponentFailed, GoalRun, Pulse, error_text
 from ibrobot_ros.options import RosOptions
 from ibrobot_ros.process import NodeProcess
 from ibrobot_ros.services import Services
 from ibrobot_ros.topics import Topics, ros_name
 
-DIAGNOSTICS = "/diagnostics"
 _NICE = 5
 """The node comes after the run itself where the processor is short."""
 _GLANCE_S = 0.1

@@ -15,6 +15,7 @@ import attrs
 import numpy as np
 
 from ibrobot_core.api import (
+    JOINT_STATES,
     NS_PER_S,
     Contract,
     EpisodeReader,
@@ -227,7 +228,7 @@ class Playback:
     def _motion(self) -> dict[str, Any]:
         """Joint states over time, thinned: `joints`, `times` [s], `positions`, and `commands` where known."""
         states = [topic for topic, each in self.summary.topics.items() if each.type == JointState.ros_type]
-        chosen = "/joint_states" if "/joint_states" in states else next(iter(states), None)
+        chosen = JOINT_STATES if JOINT_STATES in states else next(iter(states), None)
         motion: dict[str, Any] = {"joints": [], "times": [], "positions": [], "commands": []}
         if chosen is None:
             return motion

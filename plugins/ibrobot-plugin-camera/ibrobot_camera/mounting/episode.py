@@ -18,6 +18,7 @@ from ibrobot_camera.intrinsics.board import Board
 from ibrobot_camera.intrinsics.views import find
 from ibrobot_camera.mounting.shots import Lens, Shot, shot_of
 from ibrobot_core.api import (
+    JOINT_STATES,
     NS_PER_S,
     CameraInfo,
     CompressedImage,
@@ -30,7 +31,6 @@ from ibrobot_core.api import (
 )
 from ibrobot_core.app import installed_plugins
 
-JOINT_STATES = "/joint_states"
 _AROUND_NS = NS_PER_S // 10
 """The arm stands still before and after a picture for at least this time [ns]."""
 _STILL = 0.005

@@ -59,7 +59,7 @@ type Send = Callable[[ExecutorGoal], None]
 
 
 @attrs.define(eq=False)
-class _Track:
+class Track:
     """A goal that an executor follows."""
 
     goal_id: str
@@ -70,6 +70,7 @@ class _Track:
 
     @cached_property
     def motion(self) -> Motion | None:
+        """The trajectory as a motion, if it is one."""
         return None if self.trajectory is None else motion_of(self.trajectory)
 
 
@@ -95,7 +96,7 @@ class GoalDoor(SessionWorker):
         """Trajectories that a planner's source has completed from where the robot is."""
         self._door = threading.Lock()
         """Held while a goal passes."""
-        self._tracks: dict[str, _Track] = {}
+        self._tracks: dict[str, Track] = {}
         """Executor -> the goal that it follows."""
         self._begun = threading.Condition()
         """Notified when goals begin or end."""
@@ -310,7 +311,7 @@ class GoalDoor(SessionWorker):
 
     def _send(self, executor: str, goal_id: str, goal: FollowTrajectory, send: Send) -> None:
         self._check_granted(goal.trajectory)
-        before, track = self._tracks.get(executor), _Track(goal_id, goal.trajectory)
+        before, track = self._tracks.get(executor), Track(goal_id, goal.trajectory)
         self._tracks[executor] = track
         try:
             send(goal)
@@ -321,7 +322,7 @@ class GoalDoor(SessionWorker):
                     self._tracks[executor] = before
             raise
 
-    def _watch(self, name: str, track: _Track, trajectory: JointTrajectory, begin_ns: int) -> None:
+    def _watch(self, name: str, track: Track, trajectory: JointTrajectory, begin_ns: int) -> None:
         """Stop a motion that the present world blocks."""
         state = self.session.state
         if state is None or not self._is_checked():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from functools import cached_property
 from typing import Any
 
 import attrs
@@ -24,7 +23,7 @@ from ibrobot_core.api import (
     seconds,
 )
 from ibrobot_core.app import GoalRun, RunView
-from ibrobot_planning.execution.door import GoalDoor
+from ibrobot_planning.execution.door import GoalDoor, Track
 from ibrobot_planning.planner import Planner
 from ibrobot_planning.planners.blend import Limits, braking, cut, joined
 from ibrobot_planning.planners.timing import Motion, motion_of, trajectory_of
@@ -38,21 +37,6 @@ _LEAD_S = 0.15
 def commanded(session: RunView) -> Vector:
     """Commanded positions [rad], shape (J,): unlike measured ones, they do not sag."""
     return session.state.command if session.state is not None else session.measured().position
-
-
-@attrs.define(eq=False)
-class _Track:
-    """A goal that an executor follows."""
-
-    goal_id: str
-    trajectory: JointTrajectory | None
-    begin_ns: int | None = None
-    """When it began, if the executor reports it [ns]."""
-
-    @cached_property
-    def motion(self) -> Motion | None:
-        """The trajectory as a motion, if it is one."""
-        return None if self.trajectory is None else motion_of(self.trajectory)
 
 
 @attrs.define(eq=False)
@@ -80,7 +64,7 @@ class Execution:
         self._planner = planner
         self._door = door
         self._lock = threading.RLock()
-        self._tracks: dict[str, _Track] = {}
+        self._tracks: dict[str, Track] = {}
         """Executor -> the goal that it follows."""
         self._ahead: dict[str, _Next] = {}
         """Executor -> the goal that waits for its braking motion."""
@@ -133,7 +117,7 @@ class Execution:
                     session.log.warning("%s does not slow down, and is cancelled: %s", name, error)
                     session.cancel_goals()
                     return
-                self._tracks[name] = _Track(goal_id, None)
+                self._tracks[name] = Track(goal_id, None)
 
     def brake(self, number: int, stops: int) -> Vector | None:
         """Brake along the path after a moment, unless `follow` adds the next motion before.
@@ -239,7 +223,7 @@ class Execution:
         if trajectory is not None:
             self._door.complete(trajectory)
         self._session.send_goal(name, goal_id, goal, self._stops)
-        self._tracks[name] = _Track(goal_id, trajectory)
+        self._tracks[name] = Track(goal_id, trajectory)
 
     def _begin(self, name: str, following: _Next) -> bool:
         """Send a goal to an executor at rest; True, as it needs no retry."""
@@ -276,7 +260,7 @@ class Execution:
         return braked or None
 
     def _blended(
-        self, name: str, track: _Track, running: JointTrajectory, following: _Next, goal: JointTrajectory
+        self, name: str, track: Track, running: JointTrajectory, following: _Next, goal: JointTrajectory
     ) -> bool:
         """Begin a motion while the executor brakes; False if its time has not come."""
         state, old, new = self._session.state, track.motion, following.motion

@@ -43,17 +43,9 @@ class GoalCheckOptions(Options):
 
 @documented
 @attrs.frozen
-class RrtConnectOptions(Options):
+class RrtConnectOptions(GoalCheckOptions):
     """Options of `type: rrt_connect`."""
 
-    padding: float = option(0.005, unit="m", ge=0, le=0.1, help="minimum distance of the arm from objects")
-    self_padding: float = option(0.0, unit="m", ge=0, le=0.1, help="minimum distance between links of the arm")
-    floor: float | None = option(
-        None,
-        unit="m",
-        help="height of the table or floor in the base frame; everything below is blocked; none: that of"
-        " robot.description",
-    )
     planning_time: float = option(5.0, unit="s", gt=0, help="time limit of a search")
     velocity_scaling: float = option(1.0, gt=0, le=1, help="fraction of the velocity limits for a scaling of 1.0")
     acceleration_scaling: float = option(

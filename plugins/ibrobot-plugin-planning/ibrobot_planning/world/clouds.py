@@ -13,6 +13,7 @@ from ibrobot_kinematics.poses import matrix
 from ibrobot_kinematics.run_frames import Frames, UnknownFrame
 
 from ibrobot_core.api import (
+    DIAGNOSTICS,
     CameraInfo,
     ContractError,
     DiagnosticArray,
@@ -53,7 +54,7 @@ _PIXELS = 3
 """Pixels along the edge of a cell at the furthest distance; images are thinned to about this."""
 _USUAL = 10
 """Number of earlier messages with which a message is compared to find out whether the sensor is covered."""
-_DIAGNOSTICS, _DIAGNOSTICS_S = "/diagnostics", 1.0
+_DIAGNOSTICS_S = 1.0
 _GLANCE_S = 0.1
 """Interval at which the ages are checked without clouds [s]."""
 
@@ -157,7 +158,7 @@ class SensedWorld(SessionWorker):
             return
         self._told_ns = now_ns
         statuses = tuple(_status(name, age, robot) for name, age in ages.items())
-        self.session.bus.publish(_DIAGNOSTICS, DiagnosticArray(Header(now_ns), statuses))
+        self.session.bus.publish(DIAGNOSTICS, DiagnosticArray(Header(now_ns), statuses))
 
 
 def _status(name: str, age: AgeSummary, robot: str) -> DiagnosticStatus:
