@@ -44,7 +44,7 @@ class HandMoved:
         self._set_ns = 0
 
     def check(self) -> None:
-        """Check, before the device is connected, that there is a terminal if the deadman needs one.
+        """Check for the terminal that the deadman needs, before the device is connected.
 
         Raises:
             TeleopError: if there is none.
