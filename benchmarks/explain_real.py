@@ -6,7 +6,8 @@ DATASET is any LeRobot dataset, or a folder of recordings. Its first `--data` re
 model; the next `--held` ones are explained as they are, and with each fault: pictures of the first camera that are
 dark, bright, blurred, covered, frozen, of other colours, turned or moved, cameras that are exchanged (where there are
 two), positions in degrees, a joint's zero shifted by 20 degrees, and two joints with each other's place. The first line
-must name the fault, and nothing if there is none. Prints a table, what else was named first, and one JSON object.
+must name the fault, and nothing if there is none. Prints a table, what else was named first, how often the fault is the
+first that the unchanged recording does not have, too, and one JSON object.
 
 No recording of a real arm comes with the repository: give one of your own, or a published one.
 """
@@ -200,7 +201,8 @@ def main() -> int:
             held[episode] = recording
     reference = Reference(maker.card())
     cameras = len(reference.card.cameras) if reference.card is not None else 0
-    right, named = Counter[str](), Counter[tuple[str, str]]()
+    right, added, named = Counter[str](), Counter[str](), Counter[tuple[str, str]]()
+    unchanged: dict[Path, set[str]] = {}
     faults = [
         name for name, fault in FAULTS.items()
         if (not arguments.faults or name in ("", *arguments.faults)) and (cameras > 1 or not fault.exchanged)
@@ -211,16 +213,20 @@ def main() -> int:
             weak = bool(diagnosis.findings) and diagnosis.findings[0].cause.weak
             first = "" if weak else diagnosis.first
             right[name] += first == name
+            names = [each.name for each in diagnosis.findings]
+            has = unchanged.setdefault(episode, set(names))  # the first round is without a fault
+            added[name] += next((each for each in names if each not in has), "") == name
             named[name, first] += first != name
             said = [(each.name, round(each.evidence.likelihood, 2)) for each in diagnosis.findings]
             print(name or "no fault", episode.name, said, file=sys.stderr, flush=True)
     for name in faults:
         others = ", ".join(f"{first or '-'} {count}" for (of, first), count in named.items() if of == name and count)
-        print(f"{name or 'no fault':20}{f'{right[name]}/{len(held)}':>8}  {others}")
+        print(f"{name or 'no fault':20}{f'{right[name]}/{len(held)}':>8}{f'{added[name]}/{len(held)}':>8}  {others}")
     planted = [name for name in faults if name]
     result = {
         "held": len(held), "cameras": cameras, "faults": len(planted), "runs": len(planted) * len(held),
         "named_first": sum(right[name] for name in planted), "unchanged_accused": len(held) - right[""],
+        "first_of_added": sum(added[name] for name in planted),
     }  # fmt: skip
     print(json.dumps(result))
     report(**result)

@@ -250,7 +250,7 @@ CLAIMS = (
         "datasets_check",
         "`ibrobot datasets check` lists demonstrations with a planted fault, and seldom a good one",
         "docs/how-to/explain-a-failure.md",
-        "datasets_check.py",
+        "datasets_check.py --episodes 1000 --each 6",
     ),
     Claim(
         "datasets_drop",

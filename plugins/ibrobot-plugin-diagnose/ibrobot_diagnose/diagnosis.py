@@ -116,8 +116,8 @@ def diagnose(
     for cause in installed.causes:
         if (cause.needs - there) & {"demonstration", "motion", "rig"}:
             continue  # it is about another kind of window
-        if lacking := sorted(cause.needs - there):
-            untested.append((cause.name, _LACKS.get(lacking[0], lacking[0])))
+        if lacking := cause.needs - there:  # what was not recorded says more than what was not given
+            untested.append((cause.name, next(why for name, why in _LACKS.items() if name in lacking)))
             continue
         try:
             evidence: Any = cause.test(window, reference)
@@ -142,7 +142,7 @@ def diagnose(
 def ranked(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     """Findings by likelihood, each after those that explain it; what explains another is at least as likely.
 
-    Except for a weak policy: that one errs does not make it likelier that nothing is wrong with the set-up.
+    A weak policy comes last: that one errs does not make it likelier that nothing is wrong with the set-up.
     """
     likely = {
         each.name: max(
@@ -152,7 +152,7 @@ def ranked(findings: Sequence[Finding]) -> tuple[Finding, ...]:
         )
         for each in findings
     }
-    rest = sorted(findings, key=lambda each: (-likely[each.name], each.name))
+    rest = sorted(findings, key=lambda each: (each.cause.weak, -likely[each.name], each.name))
     ordered: list[Finding] = []
     while rest:
         free = [each for each in rest if not any(other.explains(each) for other in rest if other is not each)]

@@ -17,6 +17,10 @@ _LEAST = 5e-5
 """Least mean difference that is shown in words [rad]."""
 
 
+_MOVES = 5e-4
+"""Least motion of an answer that is shown in words [rad]."""
+
+
 @attrs.frozen(eq=False)
 class Explanation:
     """A window with its diagnosis."""
@@ -101,8 +105,14 @@ class Explanation:
         counts = f"{equal} of {len(model.again)} answers are equal, bit for bit"
         lines = [f"The model asked again ({model.identity or 'here'}): {counts}."]
         lines += [f"   The first difference: {model.whose}."] if model.whose else []
-        shown = "; ".join(f"{each.what} {each.change} {each.largest:.3f} rad" for each in model.effects[:12])
-        return [*lines, f"How far its answers move: {shown}."] if shown else lines
+        shown = [
+            f"{each.what} {each.change} {each.largest:.3f} rad" for each in model.effects if each.largest >= _MOVES
+        ]
+        if shown:
+            lines.append(f"How far its answers move: {'; '.join(shown[:12])}.")
+        elif model.effects:
+            lines.append(f"Its answers stay the same, whichever of {len(model.effects)} changes its observations have.")
+        return lines
 
     def lines_between(self) -> list[str]:
         """What happened between the model's answers and the arm, and how the model answers now, in words."""
@@ -193,8 +203,8 @@ def between_lines(window: Window, course: Course | None) -> list[str]:
         lines.append(f"Mean difference from the newest answer to the arm: {', '.join(parts) or 'none'}.")
         times = {
             "held without a plan": facts["share_held"], "moved by an operator": facts["share_operated"],
-            **{f"at a limit of {name}": share for name, share in facts["share_at_limit"].items()},
+            **{f"at a {name} limit": share for name, share in facts["share_at_limit"].items()},
         }  # fmt: skip
-        if spent := [f"{what} for {100 * share:.1f} %" for what, share in times.items() if share]:
-            lines.append(f"Of the time, the arm was {', '.join(spent)}.")
+        if spent := [f"{what} {100 * share:.1f} %" for what, share in times.items() if share]:
+            lines.append(f"Share of the time: {', '.join(spent)}.")
     return lines

@@ -10,8 +10,8 @@ from ibrobot_diagnose.diagnosis import diagnose
 from ibrobot_diagnose.report import Explanation
 from made_runs import Run, window_of
 
-SOMETIMES = ("guard", "operator", "without a plan", "limit of velocity")
-_CATCHES_UP = ("limit of velocity",)
+SOMETIMES = ("guard", "operator", "without a plan", "velocity limit")
+_CATCHES_UP = ("velocity limit",)
 """Commands that were held back return to the plan as fast as they may."""
 
 
@@ -22,7 +22,7 @@ _CATCHES_UP = ("limit of velocity",)
         pytest.param({"guarded": (0.3, 0.7)}, {"guard", *_CATCHES_UP}, id="guarded"),
         pytest.param({"takeover": (0.2, 0.6)}, {"operator", *_CATCHES_UP}, id="taken-over"),
         pytest.param({"latency_s": 1.1}, {"without a plan", *_CATCHES_UP}, id="plan-dry"),
-        pytest.param({"velocity": 0.3}, {"limit of velocity"}, id="slow-joints"),
+        pytest.param({"velocity": 0.3}, {"velocity limit"}, id="slow-joints"),
     ],
 )
 def test_only_what_a_run_has_is_counted_between_answer_and_arm(changes: dict[str, Any], said: set[str]) -> None:

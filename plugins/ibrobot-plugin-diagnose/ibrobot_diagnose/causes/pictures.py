@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, override
 
@@ -58,6 +59,15 @@ class Pair:
         own = np.stack([self.camera.pictures[i].small for i in index[alike].tolist()])
         return own, self.card.thumbnails[near[alike]]
 
+    def fits_better(self, other: Pair, changed: Callable[[Any], Any] = lambda small: small) -> tuple[float, float]:
+        """Whether this camera's pictures, if they are changed, fit another pair's data better than its own.
+
+        Returns: the share of the pictures that are nearer to a picture there, and how many times as near they are.
+        """
+        own, vectors = (descriptors(each) for each in (self.camera.sample, changed(self.camera.sample)))
+        here, there = nearest(own, self.card.vectors)[0], nearest(vectors, other.card.vectors)[0]
+        return float((there < here).mean()), float(np.median(here)) / max(float(np.median(there)), 1e-3)
+
     def distance(self, changed: Callable[[Any], Any] = lambda small: small) -> float:
         """Median distance to the nearest thumbnail of the data, of pictures that are changed first."""
         return float(np.median(nearest(descriptors(changed(self.camera.sample)), self.card.vectors)[0]))
@@ -91,6 +101,8 @@ class PictureCause(CardCause):
     unit: ClassVar[str] = "times"
     threshold: ClassVar[float]
     certain: ClassVar[float]
+    of_stills: ClassVar[tuple[float, float] | None] = None
+    """Threshold and certain number of the stills of a rig, if others."""
 
     def measure(self, pair: Pair) -> tuple[float, str] | None:
         """How strong it is, by `threshold` and `certain`, and a sentence; None if it is uncertain."""
@@ -120,9 +132,10 @@ class PictureCause(CardCause):
         if not measured:
             return None
         number, text, sight = max(measured, key=lambda each: each[0])
-        likely = likelihood(number, self.threshold, self.certain)
+        threshold, certain = self.of_stills or (self.threshold, self.certain)
+        likely = likelihood(number, threshold, certain)
         shown = now_and_then(sight) if likely > 0.4 else ()
-        return Evidence(text, number, self.unit, self.threshold, likely, pictures=shown, fails=self.certain)
+        return Evidence(text, number, self.unit, threshold, likely, pictures=shown, fails=certain)
 
 
 def now_and_then(sight: Sight) -> tuple[Shown, ...]:
@@ -147,26 +160,22 @@ class CamerasExchanged(CardCause):
 
     @override
     def compare(self, window: Window, card: Card) -> Evidence | None:
-        each = list(pairs(window, card))
-        best: tuple[float, Pair, Pair] | None = None
-        for a in range(len(each)):
-            for b in range(a + 1, len(each)):
-                one, other = each[a], each[b]
-                own = one.distance() + other.distance()
-                crossed = sum(
-                    Pair(*both, window).distance() for both in ((one.camera, other.card), (other.camera, one.card))
-                )
-                ratio = own / max(crossed, 1e-3)
-                if best is None or ratio > best[0]:
-                    best = ratio, one, other
+        best: tuple[float, float, float, Pair, Pair] | None = None
+        for one, other in itertools.combinations(pairs(window, card), 2):
+            fits = one.fits_better(other), other.fits_better(one)
+            share, ratio = (min(each) for each in zip(*fits, strict=True))
+            # Each picture of both shows it; a few pictures that look like the other's do not.
+            likely = min(likelihood(share, 0.7, 0.9), likelihood(ratio, 1.1, 1.25))
+            if best is None or likely > best[0]:
+                best = likely, share, ratio, one, other
         if best is None:
             return None
-        ratio, one, other = best
+        likely, share, ratio, one, other = best
         text = (
-            f"The cameras {one.camera.name} and {other.camera.name} are exchanged: the pictures of each are "
-            f"{ratio:.1f} times as close to the other's in the data as to its own."
+            f"The cameras {one.camera.name} and {other.camera.name} are exchanged: at least {100 * share:.0f} % of the "
+            f"pictures of each look more like the other's in the data, and are {ratio:.1f} times as close to these."
         )
-        return Evidence(text, ratio, "times", 1.4, likelihood(ratio, 1.4, 2.2), pictures=one.beside() + other.beside())
+        return Evidence(text, 100 * share, "%", 70.0, likely, pictures=one.beside() + other.beside())
 
 
 class CameraMoved(PictureCause):
@@ -180,6 +189,10 @@ class CameraMoved(PictureCause):
         "Put the camera back: “Put a camera back” under “Devices” of the page shows its live picture over that of "
         "then, and how far it still is; the report (`--out`) has both pictures. If it must stay there, record some "
         "episodes from its new place and train again."
+    )
+    for_episodes = (
+        "Drop it if the camera has been put back since. If it stays where it stands now, keep it, and record more from "
+        "there."
     )
 
     @override
@@ -353,9 +366,9 @@ class PictureCovered(PictureCause):
     def _of_riding(pair: Pair) -> tuple[float, str] | None:
         """For a camera on the arm, which sees another part of the scene in each pose."""
         alike = pair.at_like_poses()
-        if alike is None:
-            return None
-        known = np.median([_texture(each.mean(axis=2)) for each in alike[1]], axis=0)
+        # Without like poses only what nearly always shows something in the data counts, whatever the pose.
+        seen, level = (pair.card.thumbnails, 0.1) if alike is None else (alike[1], 0.5)
+        known = np.quantile([_texture(each.mean(axis=2)) for each in seen], level, axis=0)
         # An object that the arm does not hold leaves an area empty in some pictures, what covers it in nearly all.
         own = np.quantile([_texture(each.mean(axis=2)) for each in pair.camera.sample], 0.9, axis=0)
         rich = known > max(6.0, 0.4 * float(np.median(known)))
@@ -449,7 +462,8 @@ class Bgr(PictureCause):
 
     name, title = "bgr", "red is red, and blue is blue"
     explains = UNSEEN | {"white_balance", "picture_covered"}
-    threshold, certain = 1.25, 2.0
+    threshold, certain = 1.07, 1.2  # of nearly all pictures
+    of_stills = 1.25, 2.0
     remedy = (
         "Exchange red and blue: the camera delivers BGR as RGB. Set its `encoding`, or that of the contract's image, "
         "as it "
@@ -463,7 +477,9 @@ class Bgr(PictureCause):
 
     @override
     def measure(self, pair: Pair) -> tuple[float, str] | None:
-        ratio = pair.distance() / max(pair.distance(lambda small: small[..., ::-1]), 1e-3)
+        share, ratio = pair.fits_better(pair, lambda small: small[..., ::-1])
+        if share < 0.9:
+            return None  # some pictures alone may be of scenes that fit the data so by chance
         text = (
             f"Red and blue of {pair.camera.name} are exchanged: with them back, the pictures are {ratio:.1f} times as "
             "close to those of the data."
