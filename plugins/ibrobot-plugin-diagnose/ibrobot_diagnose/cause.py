@@ -139,6 +139,15 @@ class Cause(ABC):
     """What mends an episode of a dataset with it."""
     remedy: ClassVar[str]
     """What to do, in the imperative."""
+    for_episodes: ClassVar[str] = ""
+    """What to do with an episode of a dataset, if it is not the remedy."""
+
+    @classmethod
+    def to_do_with_episode(cls) -> str:
+        """What to do with an episode of a dataset that has it."""
+        if cls.for_episodes or "demonstration" in cls.needs:
+            return cls.for_episodes or cls.remedy
+        return f"Drop it, unless runs will be like it. Before the next recordings: {cls.remedy}"
 
     @abstractmethod
     def test(self, window: Window, reference: Reference) -> Evidence | None:

@@ -50,7 +50,8 @@ def contents_of(facts: Mapping[str, Any]) -> list[ReportSection]:
     cases = tuple(
         _case(i, each, Path(facts["paths"][i]), facts["folders"][i]) for i, each in enumerate(facts["listed"])
     )
-    blocks: list[Text | Table | Cases] = [Text(facts["first"], "verdict")]
+    verdict = facts["first"].partition(": ")[0] if cases else facts["first"]  # a table below has the counts
+    blocks: list[Text | Table | Cases] = [Text(verdict, "verdict")]
     if cases:
         blocks.append(Text("The worst come first. What a click does can be undone.", "note"))
         blocks.append(Cases(cases))
@@ -72,10 +73,11 @@ def _number_of(episode: Path) -> int:
 
 def _case(number: int, each: Mapping[str, Any], path: Path, checked: int) -> Case:
     first, *others = each["causes"]
-    more = f" Also: {', '.join(other['name'] for other in others)}." if others else ""
-    text = f"{first['text']}{more} {first['remedy']}"
     is_same = _number_of(path) == checked  # the times of what was trimmed since are no longer right
-    text += "" if is_same else " It has changed since the check."
+    lines = [first["text"]]
+    lines += [f"Also: {', '.join(other['name'] for other in others)}."] if others else []
+    lines += [first["remedy"], *([] if is_same else ["It has changed since the check."])]
+    text = "\n".join(lines)
     fixes = tuple(_fixes(each)) if is_same and checked else ()
     return Case(f"{number + 1}. {path.name}", text, path, at_s=first["since_s"] or 0.0, fixes=fixes)
 

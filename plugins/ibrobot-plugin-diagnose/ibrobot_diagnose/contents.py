@@ -158,7 +158,7 @@ def _plots(explanation: Explanation) -> Iterator[str]:
         down = axis_of([low - room, high + room], _HEIGHT - 36, 24)
         parts = [*grid_below(across, 24, _HEIGHT - 36, "s"), *grid_beside(down, 44, _WIDTH - 8)]
         parts.append(caption(44, 14, f"{joint} [rad]", "start"))
-        classes = {"state": "range", "command": "estimate", "answer": "margin"}
+        classes = {"state": "range", "command": "zero", "answer": "margin"}
         for name, values in tracks.items():
             parts += [
                 tag("polyline", points=points, fill="none", class_=classes[name])

@@ -22,6 +22,7 @@ class OtherPrompt(CardCause):
     title = "the task is one of the data's"
     explains = frozenset({"stands_still"})
     remedy = "Give the model a task of its data, in the same words: `inference: {prompt: …}`."
+    for_episodes = "Drop it, unless the dataset is to teach this task, too: then record some more of it."
 
     @override
     def compare(self, window: Window, card: Card) -> Evidence | None:
@@ -53,6 +54,7 @@ class UnseenStart(CardCause):
     needs = frozenset({"motion", "state", "card"})
     explains = frozenset({"unseen_states", "stands_still"})
     remedy = "Bring the arm to the start of the demonstrations before each run, or record episodes that begin here."
+    for_episodes = "Drop it, unless runs begin here, too: then record some more that do."
 
     @override
     def compare(self, window: Window, card: Card) -> Evidence | None:
@@ -134,6 +136,7 @@ class OtherSpeed(CardCause):
         "Execute chunks at the rate of the data: `contract: {rate_hz: …}` of the robot and of the recordings must "
         "agree; look for a policy that was trained on data that was sampled at another rate."
     )
+    for_episodes = "Drop it, unless the task may take as long: a policy learns the speeds of all."
 
     @override
     def compare(self, window: Window, card: Card) -> Evidence | None:

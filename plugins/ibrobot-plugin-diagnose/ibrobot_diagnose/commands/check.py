@@ -182,7 +182,7 @@ def check_episode(order: tuple[Path, Card], progress: Callable[[int], None] = la
     shown = list(findings[0].evidence.pictures) if findings else []
     if findings and not shown:
         shown = list(_seen(window, findings[0].evidence.since_s or 0.0))
-    facts = [finding_facts(each) for each in findings]
+    facts = [{**finding_facts(each), "remedy": each.cause.to_do_with_episode()} for each in findings]
     return Checked(window.outcome, window.seconds, facts, shown[:_MOST], diagnosis.broken)
 
 

@@ -23,8 +23,8 @@ export class View {
     this.player = new Player(this.ui);
     this.mending = h("div", { class: "row" });
     this.playing = h("section", { class: "card", hidden: true, "aria-label": "Recording" },
-      h("div", { class: "row" }, this.recording = h("h3", {}), h("button", { onclick: () => this.play("") }, "Close")),
-      this.problem = h("div", {}), this.player.element, this.mending);
+      h("div", { class: "row" }, this.recording = h("h3", { tabindex: "-1" }), h("button", { onclick: () => this.play("") }, "Close")),
+      this.reason = h("div", {}), this.problem = h("div", {}), this.player.element, this.mending);
     this.head = h("h2", { tabindex: "-1" });
     this.body = h("div", {});
     this.detail = h("section", { class: "card report", hidden: true, "aria-label": "Report" },
@@ -62,7 +62,10 @@ export class View {
   }
 
   async open(path) {
-    if (path !== this.path) this.play("");
+    if (path !== this.path) {
+      this.from = null;
+      this.play("");
+    }
     this.path = path;
     this.detail.hidden = !path;
     for (const each of this.list.querySelectorAll("tr")) each.classList.toggle("current", each.querySelector("a")?.textContent === path);
@@ -102,7 +105,7 @@ export class View {
     return h("article", { class: "case" }, h("h4", {}, title),
       video ? h("video", { src: `${this.ui.address("reports/video", { path: video })}#t=0.01`, controls: true, muted: true, preload: "metadata", "aria-label": `Video of ${title}` }) : null,
       shown ? h("img", { src: this.ui.address("reports/picture", { path: shown }), alt: title }) : null,
-      text ? h("p", {}, text) : null,
+      paragraphs(text),
       episode ? h("p", {}, h("a", { href: `#episodes/${encodeURIComponent(episode)}` }, episode)) : null,
       command ? h("code", {}, command) : null,
       h("div", { class: "row" },
@@ -128,18 +131,24 @@ export class View {
 
   async mend(title, path, { label, does, outcome, begin_s, end_s }) {
     const folder = path.includes("/") ? path.slice(0, path.lastIndexOf("/")) : ".";
-    const before = does === "mark" ? await this.ui.attempt(() => this.ui.get("episodes/open", { path })) : { outcome };
+    const before = does === "delete" ? {} : await this.ui.attempt(() => this.ui.get("episodes/open", { path }));
     if (!before) return;
     const answer = await this.ui.attempt(async () => {
       if (does === "delete") return this.ui.post("episodes/delete", { paths: [path] });
-      if (does === "trim") await this.ui.post("episodes/trim", { path, begin_s, end_s });
+      if (does === "trim") await this.ui.post("episodes/trim", { path, begin_s, end_s: Math.min(end_s, before.duration_s) });
       return does === "trim" && !outcome ? null : this.ui.post("episodes/mark", { paths: [path], outcome });
     });
     if (answer === undefined) return;
     this.mended.set(this.keyOf(title), { label, does, path, folder, outcome: before.outcome });
     if (does === "delete" && this.player.path === path) this.player.close();
+    if (does === "trim") this.again(path);
     this.draw();
     this.drawMending();
+  }
+
+  // Opens the recording in the player again, since it has changed.
+  again(path) {
+    if (!this.playing.hidden && this.played?.episode === path) this.player.open(path, this.problem);
   }
 
   // Puts the original back, or judges as before.
@@ -154,6 +163,7 @@ export class View {
     });
     if (answer === undefined) return;
     this.mended.delete(this.keyOf(title));
+    if (does !== "mark") this.again(path);
     this.draw();
     this.drawMending();
   }
@@ -163,7 +173,7 @@ export class View {
     replace(this.mending, ...(this.played ? this.fixes(this.played) : []));
   }
 
-  // Plays a recording until it is closed, which leads back to where it was opened.
+  // Plays a recording until it is closed, which leads back to where it was opened, with the focus.
   async play(path, title = "", from = null, at = 0, played = null) {
     this.playing.hidden = !path;
     this.played = played;
@@ -172,18 +182,25 @@ export class View {
     this.from = from;
     if (!path) {
       this.player.close();
-      opener?.scrollIntoView({ block: "center" });
+      const label = opener?.getAttribute("aria-label"); // what was mended meanwhile has new buttons
+      const back = label && [...this.body.querySelectorAll("button")].find((each) => each.getAttribute("aria-label") === label);
+      back?.scrollIntoView({ block: "center" });
+      back?.focus({ preventScroll: true });
       return;
     }
     say(this.recording, title);
+    replace(this.reason, paragraphs(played?.text ?? ""));
     this.problem.replaceChildren();
     if (await this.player.open(path, this.problem)) {
       if (at > 0) this.player.seek(Math.min(at, this.player.length));
       this.player.toggle();
     }
     this.playing.scrollIntoView({ block: "start" });
+    this.recording.focus({ preventScroll: true });
   }
 }
+
+const paragraphs = (text) => text.split("\n").filter(Boolean).map((line) => h("p", {}, line));
 
 async function copy(text) {
   try {
