@@ -124,7 +124,7 @@ def read_sections(
         return contents(facts)
     except KeyError as error:
         raise DatasetError(f"{file}: is not {what} of this version: it lacks {error}; make it again") from None
-    except (IndexError, TypeError, ValueError, AttributeError) as error:
+    except (IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise DatasetError(f"{file}: is not {what}: {error!r}") from None
 
 

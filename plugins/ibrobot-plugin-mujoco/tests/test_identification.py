@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import attrs
@@ -95,6 +96,20 @@ def test_file_of_parameters_and_report_are_written(result: Result, tmp_path: Pat
 def test_damaged_report_is_named(text: str, tmp_path: Path) -> None:
     (tmp_path / "identification.json").write_text(text)
     with pytest.raises(DatasetError, match=r"identification\.json: "):
+        read_contents(tmp_path)
+
+
+def test_a_number_without_bounds_in_a_report_is_named(tmp_path: Path) -> None:
+    """It cannot be drawn."""
+    names = ("before", "delay_lag_bias", "after")
+    course = {"joints": ["pan"], "times": [0.0, 0.1], **{each: [[0.0], [0.1]] for each in ("command", "measured")}}
+    facts = {
+        "robot": "arm", "seconds": 60.0, "lines": ["It is good."], "unknown": [], "parameters": [],
+        "held_out_rms_deg": dict.fromkeys(names, 1.0), "course": course | {"before": [[0.0]], "after": [[0.0]]},
+        "held_out_rms_deg_by_joint": {name: {"pan": float("inf")} for name in names},
+    }  # fmt: skip
+    (tmp_path / "identification.json").write_text(json.dumps(facts))
+    with pytest.raises(DatasetError, match=r"identification\.json: is not an identification: OverflowError"):
         read_contents(tmp_path)
 
 

@@ -19,11 +19,16 @@ PLOT_CLASSES = (
 `bad-fill` the fill of failures, `range` and `estimate` are strokes, `band` is a fill."""
 
 
+_text = attrs.validators.instance_of(str)
+_texts = attrs.validators.deep_iterable(_text, attrs.validators.instance_of(tuple))
+"""A field of another type is a TypeError, since reports are read from files."""
+
+
 @attrs.frozen
 class Text:
     """A paragraph."""
 
-    text: str
+    text: str = attrs.field(validator=_text)
     role: Literal["plain", "verdict", "note", "title"] = "plain"
 
 
@@ -31,15 +36,15 @@ class Text:
 class Table:
     """A table."""
 
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    columns: tuple[str, ...] = attrs.field(validator=_texts)
+    rows: tuple[tuple[str, ...], ...] = attrs.field(validator=attrs.validators.deep_iterable(_texts))
 
 
 @attrs.frozen
 class Plots:
     """Plots side by side, each an SVG of lines, rects, circles, paths, polygons, polylines, texts and titles."""
 
-    pictures: tuple[str, ...]
+    pictures: tuple[str, ...] = attrs.field(validator=_texts)
 
 
 @attrs.frozen
@@ -66,8 +71,8 @@ class Fix:
 class Case:
     """An episode, or a picture, worth a look."""
 
-    title: str
-    text: str
+    title: str = attrs.field(validator=_text)
+    text: str = attrs.field(validator=_text)
     episode: Path | None
     """Its recording; None if there is none."""
     video: Path | None = None
@@ -85,7 +90,7 @@ class Case:
 class ReportSection:
     """A part of a report, with a title."""
 
-    title: str
+    title: str = attrs.field(validator=_text)
     blocks: tuple[Text | Table | Plots | Cases, ...]
 
 

@@ -174,7 +174,7 @@ def read_contents(out: Path) -> Sequence[ReportSection]:
     facts = _read(out)
     try:
         return contents_of(facts)
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise DatasetError(f"{out / REPORT}: is not an identification: {error!r}") from None
 
 
