@@ -268,6 +268,22 @@ CLAIMS = (
         "preflight.py",
     ),
     Claim(
+        "preflight_photographs",
+        "on the photographs of real scenes that its measures were chosen on, and videos of a real robot, `ibrobot"
+        " preflight` accuses at most 1 in 200 unchanged ones",
+        "docs/how-to/check-a-rig.md",
+        "preflight_photographs.py PHOTOGRAPHS/tuned --unchanged 6",
+        "the photographs that the script names: `run.py --photographs FOLDER`",
+    ),
+    Claim(
+        "preflight_fresh_photographs",
+        "on photographs of real scenes that were not looked at before, `ibrobot preflight` accuses at most 1 in 200"
+        " unchanged ones, and calls none unmoved that moved by 20 pixels or 3 degrees",
+        "docs/how-to/check-a-rig.md",
+        "preflight_photographs.py PHOTOGRAPHS/fresh --unchanged 5",
+        "the photographs that the script names: `run.py --photographs FOLDER`",
+    ),
+    Claim(
         "camera_mount",
         "with 1 pixel of noise and 20 % of wrong pictures, `ibrobot camera mount` finds the mount of a camera in the"
         " hand or on a stand within 3 mm and 0.5 degrees, or says that it cannot",
@@ -369,6 +385,7 @@ def main() -> int:
     parser.add_argument("--page", action="store_true", help="write the table of the page")
     parser.add_argument("--lerobot", metavar="PYTHON", help="an interpreter with LeRobot")
     parser.add_argument("--dataset", metavar="DATASET", help="recordings of a real arm")
+    parser.add_argument("--photographs", metavar="FOLDER", help="with the folders `tuned` and `fresh`")
     asked = parser.parse_args()
     known = {claim.name: claim for claim in CLAIMS}
     if unknown := [name for name in asked.names if name not in known]:
@@ -384,8 +401,11 @@ def main() -> int:
     rows, missed, good = [], [], {}
     for claim in claims:
         command = claim.command
-        given = {"PYTHON": ("--lerobot", asked.lerobot), "DATASET": ("--dataset", asked.dataset)}
-        words = {word: each for word, each in given.items() if word in command.split()}
+        given = {
+            "PYTHON": ("--lerobot", asked.lerobot), "DATASET": ("--dataset", asked.dataset),
+            "PHOTOGRAPHS": ("--photographs", asked.photographs),
+        }  # fmt: skip
+        words = {word: each for word, each in given.items() if word in command}
         if lacking := [option for option, value in words.values() if not value]:
             missed.append(f"{claim.name}: not measured, {lacking[0]} is missing")
             continue

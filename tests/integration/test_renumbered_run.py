@@ -216,7 +216,7 @@ def goals(bench: Bench) -> dict[str, list[int]]:
     return {serial: [servo.get("goal_position") for servo in arm.servos.values()] for serial, arm in bench.arms.items()}
 
 
-def test_cameras_that_are_counted_are_told_apart_by_their_pictures(bench: Bench) -> None:
+def test_pictures_tell_counted_cameras_apart(bench: Bench) -> None:
     bench.boot(BOOT)
     refuses = "\npreflight: {against: rig.json, action: refuse}\n"
     bench.robot("serial:FOLLOWER", "serial:LEADER", {"top": 0, "wrist": 2}, refuses)

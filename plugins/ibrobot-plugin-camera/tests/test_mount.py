@@ -25,7 +25,7 @@ from ibrobot_kinematics.poses import homogeneous, matrix
 from ibrobot_kinematics.rotations import exp
 from ibrobot_kinematics.urdf import read_urdf
 
-from ibrobot_core.api import CameraInfo, Header, IbrobotError, Pose, SensorError
+from ibrobot_core.api import JOINT_STATES, CameraInfo, Header, IbrobotError, Pose, SensorError
 from ibrobot_core.app import parse_yaml
 
 from .mount_rig import JOINTS, LENS, OPTICAL, made, off, urdf
@@ -225,7 +225,7 @@ def test_a_calibration_that_cannot_be_used_is_named_with_its_episode(
 ) -> None:
     message = attrs.evolve(CameraInfo(Header(0, "eye"), 48, 64), **info)
     reader = SimpleNamespace(
-        summary=lambda: SimpleNamespace(topics=(episode.JOINT_STATES, "/camera/eye/image_raw")),
+        summary=lambda: SimpleNamespace(topics=(JOINT_STATES, "/camera/eye/image_raw")),
         messages=lambda topics: [SimpleNamespace(message=message)],
         close=lambda: None,
     )

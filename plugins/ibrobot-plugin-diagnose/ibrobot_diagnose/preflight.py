@@ -66,12 +66,12 @@ class Preflight:
 
     def to_do(self, finding: Finding) -> str:
         """What to do about a finding: its remedy, or first that of the finding that causes it."""
-        found = self.diagnosis.findings
-        number = next((i for i, each in enumerate(found) if each is finding), None)
+        findings = self.diagnosis.findings
+        number = next((i for i, each in enumerate(findings) if each is finding), None)
         source = self.diagnosis.source_of(number) if number is not None else None
         if source is None:
             return finding.cause.remedy
-        return f"First do what {found[source].name} asks for: this is probably a consequence of it."
+        return f"First do what {findings[source].name} asks for: this is probably a consequence of it."
 
     def facts(self) -> dict[str, Any]:
         """The result as a JSON object."""

@@ -142,6 +142,7 @@ def test_name_that_needs_a_heavy_package_is_right_in_a_module_with_many_names(si
 
 
 def test_module_that_does_not_end_is_an_error(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["pytest"])  # xdist's own is "-c", as that of the import alone
     install(site, "import sys, time\nif sys.argv[0] == '-c': time.sleep(600)\n" + PLUGIN)
     monkeypatch.setattr("ibrobot_kit.check._IMPORT_S", 0.01)
     check = checks()["weight"]

@@ -14,5 +14,5 @@ class QuietTerminal(FakeTerminal):
 
 @hookimpl
 def ibrobot_terminals():
-    for type_, make in (("printing", FakeTerminal), ("quiet", QuietTerminal)):
-        yield Descriptor(type_, make=lambda options, ctx, make=make: make(), summary=type_, default=True)
+    yield Descriptor("printing", make=lambda options, ctx: FakeTerminal(), summary="prints", default=True)
+    yield Descriptor("quiet", make=lambda options, ctx: QuietTerminal(), summary="quiet", default=True)
