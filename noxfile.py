@@ -129,9 +129,11 @@ def install(
     session.install("-c", "constraints.txt", *options, *packages(*distributions, *groups_need, plain=plain))
 
 
-def lacking(session: nox.Session) -> list[dict[str, Any]]:
-    """The installed types that lack something on this machine."""
-    rows: list[dict[str, Any]] = json.loads(str(session.run("python", "tests/house/lacking.py", silent=True)))
+def lacking(session: nox.Session, python: str) -> list[dict[str, Any]]:
+    """The types installed for `python` that lack something on this machine."""
+    rows: list[dict[str, Any]] = json.loads(
+        str(session.run(python, "tests/house/lacking.py", silent=True, external=True))
+    )
     return rows
 
 
@@ -161,19 +163,20 @@ def chromium(session: nox.Session) -> None:
             note_untested(session, f"web pages are not tested: apt-get install {' '.join(wanted)}")
 
 
-def system_libraries(session: nox.Session) -> None:
+def system_libraries(session: nox.Session, python: str = "python") -> bool:
     """Check for the system libraries that installed types lack: root installs them, anybody else gets the command.
 
-    Tests that need what stays missing are skipped.
+    Tests that need what stays missing are skipped. Returns whether nothing does.
     """
     with Path(".nox/apt.lock").open("w") as lock:  # one session at a time; the next one finds them installed
         fcntl.flock(lock, fcntl.LOCK_EX)
-        found = lacking(session)
+        found = lacking(session, python)
         wanted = sorted({package for row in found for package in row["apt"]})
         if wanted and apt_install(session, *wanted):
-            found = lacking(session)
+            found = lacking(session, python)
     for row in found:
         note_untested(session, f"{row['kind']} {row['type']} is not tested: {row['what']}; {row['remedy']}")
+    return not found
 
 
 @atexit.register
@@ -294,9 +297,12 @@ def check_wheels(session: nox.Session, folder: Path) -> None:
         fresh = (f"--refresh-package={name}" for name in LOCAL)
         wheels = ("--find-links", str(folder / "dist"), "-c", "constraints.txt", *fresh)
         session.run("uv", "pip", "install", "--quiet", "--python", str(environment), *wheels, requirement)
+        complete = system_libraries(session, str(environment / "bin/python"))
         with session.chdir(folder):  # away from this repository
             for command in commands:
                 program, *arguments = shlex.split(command, comments=True)
+                if arguments[:1] == ["record"] and not complete:  # a recording needs its cameras
+                    continue
                 run_again(session, str(environment / "bin" / program), *arguments)
     emulated = Path("tests/house/launch_on_emulators.py").absolute()
     with session.chdir(folder):
