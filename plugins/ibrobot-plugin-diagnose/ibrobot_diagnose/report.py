@@ -65,7 +65,7 @@ class Explanation:
             first = "the first cause" if not source else f"cause {source + 1}"
             return f"Fix {first} first: this is probably a consequence of it."
         if number and findings[number].cause.weak and not findings[0].cause.weak:
-            return f"Fix the first cause first. If the policy still fails then: {remedy[0].lower()}{remedy[1:]}"
+            return f"Fix the first cause first. If the policy still fails then: {remedy}"
         return remedy
 
     def facts(self, *, ticks: bool = False) -> dict[str, Any]:
@@ -203,7 +203,7 @@ def between_lines(window: Window, course: Course | None) -> list[str]:
         lines.append(f"Mean difference from the newest answer to the arm: {', '.join(parts) or 'none'}.")
         times = {
             "held without a plan": facts["share_held"], "moved by an operator": facts["share_operated"],
-            **{f"at a {name} limit": share for name, share in facts["share_at_limit"].items()},
+            **{f"at the {name} limit": share for name, share in facts["share_at_limit"].items()},
         }  # fmt: skip
         if spent := [f"{what} {100 * share:.1f} %" for what, share in times.items() if share]:
             lines.append(f"Share of the time: {', '.join(spent)}.")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -36,6 +38,34 @@ def test_a_table_fits_the_code(table: Path) -> None:
         for part in text.split("{}"):
             for word in re.findall(r"[^\W\d_]{4,}", part):
                 assert word.casefold() in code, f"{text!r} is no longer in the code"
+
+
+def assigned(node: ast.Assign) -> Iterator[tuple[str, ast.expr]]:
+    """Each name with what it is given."""
+    target, value = node.targets[0], node.value
+    if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
+        yield from zip(map(ast.unparse, target.elts), value.elts, strict=True)
+    else:
+        yield ast.unparse(target), value
+
+
+CAUSES = sorted((STATIC.parents[3] / "plugins/ibrobot-plugin-diagnose/ibrobot_diagnose/causes").glob("[!_]*.py"))
+
+
+@pytest.mark.skipif(not CAUSES, reason="needs the source of ibrobot-plugin-diagnose")
+@pytest.mark.parametrize("table", TABLES, ids=lambda path: path.stem)
+def test_each_cause_of_a_failure_has_its_remedy_in_the_table(table: Path) -> None:
+    said = [
+        text.value
+        for path in CAUSES
+        for each in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(each, ast.Assign)
+        for name, text in assigned(each)
+        if name in ("title", "remedy", "for_episodes") and isinstance(text, ast.Constant)
+    ]
+    assert len(said) > 120
+    known = dict(entries(table))
+    assert [text for text in said if text not in known] == []
 
 
 SHOWN = """[...document.querySelectorAll('#nav, #main')].flatMap((part) => {
