@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +18,12 @@ pytestmark = pytest.mark.integration
 def test_excitation_moves_each_joint_and_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     robot = ("so101", "--sim", "--lockstep", "--set", "simulation.scene=empty")
-    done = run_here("identify", "--excite", *robot, "--minutes", "0.5")
+    done = run_here("identify", "--excite", *robot, "--minutes", "0.5", "--events")
     assert done.returncode == 0, done.stderr
     assert "succeeded" in done.stdout
-    reader = installed_plugins().open_episode(tmp_path / "episodes/excitation/episodes/episode_000001")
+    told = json.loads(done.stdout.splitlines()[-1])
+    assert told == {"event": "excited", "dataset": str(Path("episodes/excitation"))}
+    reader = installed_plugins().open_episode(tmp_path / told["dataset"] / "episodes/episode_000001")
     try:
         messages = [each.message for each in reader.messages({"/joint_states"})]
     finally:

@@ -16,7 +16,7 @@ _ALL = "all"
 
 def camera_questions() -> Sequence[Question]:
     """Which camera: all, or one, as a robot YAML names it."""
-    names = tuple(camera.stable_id or camera.usb_path or camera.path for camera in v4l2.cameras())
+    names = tuple(camera.lasting_name or camera.path for camera in v4l2.cameras())
     return (Question("camera", "Camera", _ALL, (_ALL, *names)),)
 
 

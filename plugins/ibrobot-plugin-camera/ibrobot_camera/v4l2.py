@@ -59,6 +59,11 @@ class Camera:
     usb_path: str = ""
     """The name of its USB port under /dev/v4l/by-path, which tells equal cameras apart; empty if it has none."""
 
+    @property
+    def lasting_name(self) -> str:
+        """Its name for a robot YAML, which stays after a reboot; empty if it has none."""
+        return self.stable_id or self.usb_path
+
 
 def cameras() -> list[Camera]:
     """The capture devices of this machine."""

@@ -15,8 +15,6 @@ from ibrobot_diagnose.window import Window
 
 _LEAST = 5e-5
 """Least mean difference that is shown in words [rad]."""
-
-
 _MOVES = 5e-4
 """Least motion of an answer that is shown in words [rad]."""
 

@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, override
 
 import attrs
@@ -13,11 +14,11 @@ import pytest
 from ibrobot_provenance.asking import Ask
 from ibrobot_provenance.processes import Jobs, arguments
 from ibrobot_testing.command import command_line
-from ibrobot_web.ui import forms
+from ibrobot_web.ui import forms, jobs
 from ibrobot_web.ui.context import Ui
 from ibrobot_web.ui.folders import Folders
 from ibrobot_web.ui.forms import form_of, in_page_words, read_form
-from ibrobot_web.ui.jobs import answer, event_reader, sight
+from ibrobot_web.ui.jobs import answer, event_reader, sight, start
 
 from ibrobot_core.api import IbrobotError, MissingDependency, option
 from ibrobot_core.app import Command, Event, Registry, Shown
@@ -108,6 +109,41 @@ def test_values_of_a_form_become_arguments_that_give_the_same_options(
 
 def test_empty_fields_leave_the_choice_to_the_command(ui: Ui, tmp_path: Path) -> None:
     assert read_form(ui, BREW, {"water": "a", "cups": "", "heat": None}) == Brew(water=tmp_path / "a")
+
+
+@attrs.frozen(kw_only=True)
+class Deliver:
+    """Options of a command that runs a robot."""
+
+    robot: str = option(typed="ROBOT", names="robot", help="who brings it")
+    viewer: str | None = option(None, typed="--viewer TYPE", names="viewer", label=None, help="what shows the robot")
+
+
+def test_a_command_that_may_run_a_robot_shows_it_on_a_page(ui: Ui, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page can stop it; others get no options of runs, which they do not know."""
+    commands = {"brew": BREW, "deliver": Command("deliver", Deliver, "Bring coffee.", (Poured,))}
+    registry = Registry(commands=commands, command_packages=dict.fromkeys(commands, "coffee"))
+    for module in (forms, jobs):
+        monkeypatch.setattr(module, "installed_plugins", lambda: registry)
+    started: list[tuple[Any, ...]] = []
+
+    def note(self: Jobs, kind: str, title: str, words: Any, *, read: Any, asks: bool) -> Any:
+        started.append(
+            (title, words, read(encode_event(Poured(cups=1, of=2))), read("viewer: http://127.0.0.1:5/#token"))
+        )
+        return SimpleNamespace(number=len(started))
+
+    monkeypatch.setattr(Jobs, "start", note)
+    page = attrs.evolve(ui, run_options=("--web", "--set", "viewer.port=0"))
+    assert [start(page, name, values)["number"] for name, values in VALUES.items()] == [1, 2]
+    (brew, deliver) = started
+    assert brew[:2] == ("Brew well", ["brew", "--events", "--", str(ui.folders.first / "well")])
+    assert deliver[:2] == ("Deliver so101", ["deliver", "--events", *page.run_options, "--", "so101"])
+    assert deliver[2]["text"] == "1 cups"
+    assert deliver[3] == {"url": "http://127.0.0.1:5/#token", "watch_url": None}
+
+
+VALUES = {"brew": {"water": "well"}, "deliver": {"robot": "so101"}}
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ class HandMoved:
         self._release()
 
     def take(self, now_ns: int) -> None:
-        """Read the keys; call it at every tick [ns]."""
+        """Read the keys; call it at every tick, at the time `now_ns` [ns]."""
         self._held.take(self._keys, now_ns)
 
     def engaged(self, positions: NDArray[Any], *, complete: bool = True) -> bool:

@@ -145,8 +145,8 @@ def camera(source: str, name: str = "") -> Iterator[tuple[str, Read]]:
         yield name, read
 
 
-def of_board() -> tuple[Question, ...]:
-    """Size of the board, for `board_of`."""
+def size_questions() -> tuple[Question, ...]:
+    """Questions about the size of a board, whose answers `board_of` reads."""
     return (
         Question("squares", "Squares of the board, columns x rows", "10 x 7"),
         Question("square", "Side of a square of the printed board [mm]", "25"),
@@ -156,7 +156,7 @@ def of_board() -> tuple[Question, ...]:
 def board_questions() -> tuple[Question, ...]:
     """Of the guide that makes a board."""
     return (
-        *of_board(),
+        *size_questions(),
         Question("paper", "Paper", next(iter(PAPERS)), tuple(PAPERS)),
         Question("file", "File to write", str(_BOARD)),
     )
@@ -180,11 +180,11 @@ def questions() -> tuple[Question, ...]:
     """Of the guide for pages."""
     from ibrobot_camera import v4l2
 
-    names = tuple(each.stable_id or each.usb_path or each.path for each in v4l2.cameras())
+    names = tuple(each.lasting_name or each.path for each in v4l2.cameras())
     return (
         Question("camera", "Camera", names[0] if names else "", names, open=True),
         Question("file", "File to write", "camera.yaml"),
-        *of_board(),
+        *size_questions(),
         Question("chessboard", "The board is a plain chessboard, without markers", default=False),
     )
 

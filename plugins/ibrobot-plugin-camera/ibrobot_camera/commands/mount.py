@@ -16,7 +16,7 @@ from ibrobot_provenance.files import replace_file
 from ibrobot_terminal import Guide, Question
 
 from ibrobot_camera.calibration import load_info
-from ibrobot_camera.commands.calibrate import board_of, of_board
+from ibrobot_camera.commands.calibrate import board_of, size_questions
 from ibrobot_camera.intrinsics.board import Board
 from ibrobot_camera.mounting.edit import with_transform
 from ibrobot_camera.mounting.episode import Source
@@ -195,7 +195,7 @@ def questions() -> tuple[Question, ...]:
         Question("on", "Link that carries the camera", "gripper_link"),
         Question("board_on", "Link that carries the board; empty for the base"),
         Question("board_at", "Where the board is, if it was measured: X,Y,Z [m], ROLL,PITCH,YAW [rad]"),
-        *of_board(),
+        *size_questions(),
         Question("simulated", "Use its simulation", default=False),
     )
 

@@ -59,8 +59,8 @@ class Pair:
         own = np.stack([self.camera.pictures[i].small for i in index[alike].tolist()])
         return own, self.card.thumbnails[near[alike]]
 
-    def fits_better(self, other: Pair, changed: Callable[[Any], Any] = lambda small: small) -> tuple[float, float]:
-        """Whether this camera's pictures, if they are changed, fit another pair's data better than its own.
+    def fit_to(self, other: Pair, changed: Callable[[Any], Any] = lambda small: small) -> tuple[float, float]:
+        """How much better this camera's pictures, if they are changed, fit another pair's data than its own.
 
         Returns: the share of the pictures that are nearer to a picture there, and how many times as near they are.
         """
@@ -162,7 +162,7 @@ class CamerasExchanged(CardCause):
     def compare(self, window: Window, card: Card) -> Evidence | None:
         best: tuple[float, float, float, Pair, Pair] | None = None
         for one, other in itertools.combinations(pairs(window, card), 2):
-            fits = one.fits_better(other), other.fits_better(one)
+            fits = one.fit_to(other), other.fit_to(one)
             share, ratio = (min(each) for each in zip(*fits, strict=True))
             # Each picture of both shows it; a few pictures that look like the other's do not.
             likely = min(likelihood(share, 0.7, 0.9), likelihood(ratio, 1.1, 1.25))
@@ -477,7 +477,7 @@ class Bgr(PictureCause):
 
     @override
     def measure(self, pair: Pair) -> tuple[float, str] | None:
-        share, ratio = pair.fits_better(pair, lambda small: small[..., ::-1])
+        share, ratio = pair.fit_to(pair, lambda small: small[..., ::-1])
         if share < 0.9:
             return None  # some pictures alone may be of scenes that fit the data so by chance
         text = (

@@ -128,7 +128,7 @@ class Emulate:
                 arm.start()
                 stack.callback(arm.stop)
             _hurry()
-            echo(f"{count} servo{'s'[: count > 1]} at {self.baud} baud; Ctrl-C ends it", err=True)
+            echo(f"{count} servo{'s' if count > 1 else ''} at {self.baud} baud; Ctrl-C ends it", err=True)
             hand = Hand(emulator, self.swing) if self.swing else None
             _wait(ended, arm, hand)
 

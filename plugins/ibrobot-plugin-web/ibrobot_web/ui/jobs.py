@@ -37,11 +37,11 @@ def start(ui: Ui, command: str, values: Mapping[str, Any]) -> dict[str, int]:
     what = ", ".join([*_robots(ui, options), *(ui.folders.name(each) for each in _paths(options))])
     # A command that may run a robot shows it on a page, which can stop it.
     viewed = any(each.metadata["names"] == "viewer" for each in fields(declared.options).values())
-    read_event = event_reader(ui.folders, declared)
+    event_of = event_reader(ui.folders, declared)
     job = ui.jobs.start(
         command, f"{title_of(command)} {what}",
         [command, "--events", *(ui.run_options if viewed else ()), *arguments(options)],
-        read=lambda line: event if (event := read_event(line)) is not None else read_address(line),
+        read=lambda line: event if (event := event_of(line)) is not None else read_address(line),
         asks=Ask in declared.events,
     )  # fmt: skip
     return {"number": job.number}
