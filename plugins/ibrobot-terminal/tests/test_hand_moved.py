@@ -121,3 +121,15 @@ def test_the_robot_waits_while_the_pose_is_unknown_and_then_approaches_again() -
     before = bench.robot.copy()
     assert bench.tick().approaching
     np.testing.assert_array_equal(bench.robot, before)  # it begins where the robot is
+
+
+def test_a_mode_that_begins_again_needs_a_new_press() -> None:
+    bench = Bench("toggle")
+    bench.tick()
+    bench.keys.put("space")
+    assert bench.ticks(10).approaching
+    bench.hand.activate(bench.now_ns)
+    bench.pressed.disarm(bench.now_ns)
+    assert bench.ticks(50).positions is None
+    bench.keys.put("space")
+    assert bench.ticks(10).approaching
