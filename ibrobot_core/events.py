@@ -20,7 +20,7 @@ class Shown:
     """An event in words for a person."""
 
     text: str = ""
-    """The state of the work in one line; empty if the event does not change it."""
+    """The state of the work; empty if the event does not change it."""
     progress: float | None = None
     """Share of the work that is done, 0 to 1."""
     problem: str = ""

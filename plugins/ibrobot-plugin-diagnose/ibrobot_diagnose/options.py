@@ -73,7 +73,8 @@ class Progress(Event):
     @override
     def shown(self) -> Shown:
         problem = f"{self.episode}: {self.error}" if self.error else ""
-        return Shown(f"{self.done} of {self.of}; {self.episode}: {self.first}", self.done / max(1, self.of), problem)
+        done = f"{self.done} of {self.of} {'episode' if self.of == 1 else 'episodes'}"
+        return Shown(f"{done}; {self.episode}: {self.first}", self.done / max(1, self.of), problem)
 
 
 @attrs.frozen(kw_only=True)
@@ -86,7 +87,7 @@ class Report(Event):
     @override
     def shown(self) -> Shown:
         made = {KIND: self.out} if self.out and len(self.lines) == 1 else {}
-        return Shown("; ".join(self.lines), 1.0, made=made)
+        return Shown("\n".join(self.lines), 1.0, made=made)
 
 
 EVENTS = (Progress, Report)
@@ -132,7 +133,7 @@ class CheckReport(Event):
 
     @override
     def shown(self) -> Shown:
-        return Shown("; ".join(self.lines[:3]), 1.0, made={CHECK_KIND: self.out} if self.out else {})
+        return Shown("\n".join(self.lines[:3]), 1.0, made={CHECK_KIND: self.out} if self.out else {})
 
 
 CHECK_EVENTS = (CheckProgress, CheckReport)

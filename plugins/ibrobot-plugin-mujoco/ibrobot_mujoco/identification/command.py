@@ -51,7 +51,7 @@ class Identify(IdentifyOptions):
     @wrong_input()
     def __call__(self, emit: Emit) -> dict[str, Any] | None:
         if (self.excite is None) == (not self.episodes):
-            raise RequestError("give recordings to identify from, or --excite ROBOT to make one")
+            raise RequestError("give recordings to identify from, or a robot that makes one with --excite")
         if self.excite is not None:
             folder = self._excite(self.excite)
             if emit is not None:

@@ -18,6 +18,19 @@ export function titled(title) {
   return shown === title ? title.replace(/^\S+/, (name) => words(name)) : shown;
 }
 
+// What a job says, in lines of one sentence or of several with semicolons between them; some follow the name of an episode.
+function told(text) {
+  return text.replace(/ {2,}/g, " ").split("\n").map((line) => { // without the columns of a terminal
+    const parts = line.split("; "), shown = parts.map(sentence), whole = sentence(line);
+    return whole === line || parts.every((each, i) => each !== shown[i]) ? shown.join("; ") : whole;
+  }).join("\n");
+}
+
+function sentence(text) {
+  const shown = words(text);
+  return shown === text ? text.replace(/(?<=^\S+: ).+$/, words) : shown;
+}
+
 export class JobCard {
   constructor(ui) {
     this.ui = ui;
@@ -25,7 +38,7 @@ export class JobCard {
     this.title = h("h3", {});
     this.controls = h("div", { class: "row" });
     this.progress = h("progress", { max: "1", "aria-label": "Progress", hidden: true });
-    this.facts = h("p", {});
+    this.facts = h("p", { class: "lines" });
     this.error = h("div", {});
     this.question = new Question(ui);
     this.plot = h("canvas", { class: "plot", role: "img", hidden: true });
@@ -46,14 +59,14 @@ export class JobCard {
     this.progress.hidden = progress === undefined || job.state !== "running";
     if (progress !== undefined) this.progress.value = progress;
     const starts = job.state === "running" && RUNS.includes(job.kind) && !job.facts.url;
-    say(this.facts, starts ? `starts … ${job.lines.at(-1) ?? ""}` : job.facts.text ?? "");
+    say(this.facts, starts ? `starts … ${job.lines.at(-1) ?? ""}` : told(job.facts.text ?? ""));
     this.question.update(job);
     refresh(this.error, [job.state, job.exit_code, job.facts.error], () => (job.state === "failed" ? failure(job) : []));
     refresh(this.controls, [job.state, job.cancelling, job.facts.url, this.ui.drives], () => this.buttons(job));
     this.job = job;
     this.draw();
     const { problems = [], made = [] } = job.facts;
-    refresh(this.problems, problems, () => problems.map((each) => h("div", { class: "problem" }, each)));
+    refresh(this.problems, problems, () => problems.map((each) => h("div", { class: "problem" }, told(each))));
     refresh(this.made, [made, job.state], () => (job.state === "running" ? [] : made.flatMap((each) => this.next(each))));
     const text = job.lines.join("\n");
     this.details.hidden = !text;
@@ -82,7 +95,7 @@ export class JobCard {
     if (!points.length) return;
     const last = points.at(-1)[0];
     const end = progress ? Math.max(last, last / progress) : last;
-    this.plot.setAttribute("aria-label", words(`${axes[1]} over ${axes[0]}`));
+    this.plot.setAttribute("aria-label", words(`Plot of ${words(axes[1])} over ${words(axes[0])}`));
     drawPlot(this.plot, {
       times: points.map(([x]) => x), lines: [[axes[1], points.map(([, y]) => y)]], begin: 0, end,
       labels: [`${words(axes[1])}, ${words(axes[0])} 0`, String(Math.round(end))],
@@ -103,12 +116,12 @@ export class JobCard {
 
 // Why a job failed: its own error, or else its error lines, or its last lines.
 function failure(job) {
-  if (job.facts.error) return [problem(job.facts.error)];
+  if (job.facts.error) return [problem(told(job.facts.error))];
   if (job.exit_code < 0) return [problem(`It was killed by signal ${-job.exit_code}. Its last lines are in its output.`)];
   const errors = job.lines.filter((line) => line.startsWith("error: "));
   if (!errors.length && job.facts.problems?.length) return []; // they are the result, and are shown
   const text = errors.length ? errors.map((line) => line.slice("error: ".length)) : job.lines.slice(-8);
-  return [problem([`exit code ${job.exit_code}`, ...text].join("\n"))];
+  return [problem(told([`exit code ${job.exit_code}`, ...text].join("\n")))];
 }
 
 // The cards of the jobs of some kinds, or of all, newest first; `none` stands there before the first.
