@@ -28,6 +28,10 @@ _LACKS = {
 }  # fmt: skip
 STREAMS = frozenset({*_LACKS, "demonstration"})
 """Names of all that a cause can need."""
+_OF_ANOTHER_KIND = frozenset({"demonstration", "motion", "rig"})
+"""What a window of the wrong kind lacks."""
+_OF_RUNS = frozenset({"answers", "chunks", "outcome", "model", "training card"})
+"""What a rig at rest always lacks, since no policy runs."""
 
 
 @attrs.frozen
@@ -109,12 +113,13 @@ def diagnose(
         tested: called with the name of each cause after its test.
     """
     there = window.streams | reference.streams
+    elsewhere = _OF_ANOTHER_KIND | _OF_RUNS if window.rig is not None else _OF_ANOTHER_KIND
     findings: list[Finding] = []
     healthy, untested, measured = [], [], []
     installed = installed_causes() if causes is None else Installed(tuple(causes), (), {})
     broken = list(installed.broken)
     for cause in installed.causes:
-        if (cause.needs - there) & {"demonstration", "motion", "rig"}:
+        if (cause.needs - there) & elsewhere:
             continue  # it is about another kind of window
         if lacking := cause.needs - there:  # what was not recorded says more than what was not given
             untested.append((cause.name, next(why for name, why in _LACKS.items() if name in lacking)))

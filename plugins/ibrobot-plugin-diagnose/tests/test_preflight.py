@@ -46,7 +46,20 @@ def reference(tmp_path_factory):
 def test_rig_is_as_it_was(reference):
     code, facts = preflight("--against", reference)
     assert (code, facts["verdict"], unwell(facts), facts["notes"]) == (0, "ok", {}, [])
+    assert facts["untested"] == []  # what only a policy that runs shows is no omission
     assert {"camera_moved", "zero_shifted", "picture_dark", "camera_slow"} <= {each["name"] for each in facts["lines"]}
+
+
+def test_every_camera_that_is_dark_is_named_and_shown(reference, tmp_path):
+    dim = "simulation.scene={type: pick_cube, light: 0.4}"
+    code, facts = preflight("--against", reference, "--out", tmp_path, "--set", dim)
+    assert (code, unwell(facts)) == (1, {"picture_dark": "fail"})
+    (dark,) = (each for each in facts["lines"] if each["name"] == "picture_dark")
+    said = " ".join([dark["text"], *dark["details"]])
+    shown = json.loads((tmp_path / "preflight.json").read_text())["pictures"]
+    for camera in ("top", "wrist"):
+        assert f"The pictures of {camera} are " in said
+        assert {f"{camera} now", f"{camera} in the reference"} <= set(shown)
 
 
 def test_arm_that_stands_elsewhere_is_no_fault(reference):

@@ -8,15 +8,18 @@ from pathlib import Path
 import attrs
 import numpy as np
 import pytest
-from arm_moves import moves
+from arm_moves import TICK_NS, moves
+from ibrobot_mujoco.hardware import MujocoHardware
 from ibrobot_mujoco.identification.contents import contents_of, lines_of, read_contents, write_report
 from ibrobot_mujoco.identification.findings import findings_of
 from ibrobot_mujoco.identification.fit import ARM
 from ibrobot_mujoco.identification.identify import Result, identify
 from ibrobot_mujoco.options import MujocoOptions
 from ibrobot_mujoco.parameters import JointParameters, read_parameters
+from ibrobot_mujoco.scenes import scene
+from ibrobot_testing import control_context
 
-from ibrobot_core.api import DatasetError, Vector
+from ibrobot_core.api import DatasetError, EpisodeSetup, Vector
 
 from .planted_arm import PUBLISHED, ROBOT, STEP_S, planted, recorded, simulated
 
@@ -121,6 +124,23 @@ def test_drift_since_the_last_time_is_named(result: Result) -> None:
     found = findings_of(result.fitted, grips, attrs.evolve(last, joints=joints))
     drifts = {(each.joint, each.text.split()[1]) for each in found if each.kind == "drift"}
     assert drifts == {("shoulder_lift", "kp"), ("shoulder_lift", "backlash")}
+
+
+def test_stiff_arm_of_the_mjcf_is_simulated_as_it_is_and_has_no_weak_joint(tmp_path: Path) -> None:
+    """No file of parameters describes its servos: their damping counts towards the limit of their torque."""
+    options = MujocoOptions(scene=scene("empty"), start_pose="home", timestep=STEP_S)
+    hardware = MujocoHardware(options, control_context("sim", robot=ROBOT, period_ns=TICK_NS))
+    hardware.connect()
+    hardware.reset(EpisodeSetup(0))
+    stiff = identify(OPTIONS, ROBOT, [recorded(hardware, moves(12.0))])
+    assert np.rad2deg(stiff.totals["before"]) < 0.15
+    assert stiff.totals["after"] > 2 * stiff.totals["before"]
+    assert not [each for each in stiff.findings if each.kind in ("weak", "stiff")]
+    said = "\n".join(stiff.lines())
+    assert f"The identified simulation follows {', '.join(stiff.unlike)} less well than the one before" in said
+    assert "the parameters are not worth using" in said
+    for each in stiff.fitted.known:
+        assert each.confidence == "unknown" or each.joint not in stiff.unlike
 
 
 def test_arm_that_rests_tells_nothing(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from ibrobot_diagnose.card import (
     repeated_of,
     still,
 )
-from ibrobot_diagnose.cause import CardCause, Cause, Evidence, Reference, likelihood
+from ibrobot_diagnose.cause import ACCUSED, CardCause, Cause, Evidence, Reference, likelihood
 from ibrobot_diagnose.causes.moved import FAILS, WARNS, Sight, sights
 from ibrobot_diagnose.looks import Looks
 from ibrobot_diagnose.pictures import Shown, descriptors, nearest, resized
@@ -131,11 +131,15 @@ class PictureCause(CardCause):
         ]  # fmt: skip
         if not measured:
             return None
-        number, text, sight = max(measured, key=lambda each: each[0])
         threshold, certain = self.of_stills or (self.threshold, self.certain)
+        (number, text, sight), *others = sorted(measured, key=lambda each: -each[0])
         likely = likelihood(number, threshold, certain)
-        shown = now_and_then(sight) if likely > 0.4 else ()
-        return Evidence(text, number, self.unit, threshold, likely, pictures=shown, fails=certain)
+        also = [each for each in others if likelihood(each[0], threshold, certain) >= ACCUSED]
+        shown = [sight, *(each[2] for each in also)] if likely > 0.4 else []
+        return Evidence(
+            text, number, self.unit, threshold, likely, details=tuple(each[1] for each in also),
+            pictures=tuple(picture for each in shown for picture in now_and_then(each)), fails=certain,
+        )  # fmt: skip
 
 
 def now_and_then(sight: Sight) -> tuple[Shown, ...]:
@@ -175,7 +179,12 @@ class CamerasExchanged(CardCause):
             f"The cameras {one.camera.name} and {other.camera.name} are exchanged: at least {100 * share:.0f} % of the "
             f"pictures of each look more like the other's in the data, and are {ratio:.1f} times as close to these."
         )
-        return Evidence(text, 100 * share, "%", 70.0, likely, pictures=one.beside() + other.beside())
+        shown = one.beside() + other.beside()
+        if window.rig is not None and card.rig is not None:
+            names = one.camera.name, other.camera.name
+            stills = (now_and_then(each) for each in sights(window.rig, card.rig) if each.name in names)
+            shown = tuple(itertools.chain.from_iterable(stills)) or shown
+        return Evidence(text, 100 * share, "%", 70.0, likely, pictures=shown)
 
 
 class CameraMoved(PictureCause):

@@ -55,16 +55,20 @@ class Finding:
     is_fault: bool = False
 
 
-def findings_of(fitted: Fitted, grips: Mapping[str, bool], last: ArmParameters | None) -> list[Finding]:
+def findings_of(
+    fitted: Fitted, grips: Mapping[str, bool], last: ArmParameters | None, *, compares: bool = True
+) -> list[Finding]:
     """What stands out.
 
     Args:
         fitted: the fit.
         grips: joint -> whether it grips.
         last: the identification before; None without one.
+        compares: whether joints are compared with each other.
     """
     return [
-        *_delay(fitted), *_backlash(fitted), *_weak(fitted, grips), *_stiff(fitted), *_holding(fitted),
+        *_delay(fitted), *_backlash(fitted), *(_weak(fitted, grips) if compares else ()),
+        *(_stiff(fitted) if compares else ()), *_holding(fitted),
         *(_drifts(fitted, last) if last is not None else ()),
     ]  # fmt: skip
 
@@ -87,8 +91,9 @@ def _backlash(fitted: Fitted) -> Iterator[Finding]:
 
 
 def _weak(fitted: Fitted, grips: Mapping[str, bool]) -> Iterator[Finding]:
-    gains = [each for each in fitted.known if each.name == "kp" and not grips.get(each.joint, False)]
-    limits = [each for each in fitted.known if each.name == "torque_limit" and not grips.get(each.joint, False)]
+    carry = [each for each in fitted.known if each.confidence != "unknown" and not grips.get(each.joint, False)]
+    gains = [each for each in carry if each.name == "kp"]
+    limits = [each for each in carry if each.name == "torque_limit"]
     said: set[str] = set()
     for named, unit, what in ((limits, "Nm", "gives up at"), (gains, "Nm/rad", "has a gain of only")):
         if len(named) < 3:
@@ -96,7 +101,7 @@ def _weak(fitted: Fitted, grips: Mapping[str, bool]) -> Iterator[Finding]:
         middle = float(np.median([each.value for each in named]))
         for each in named:
             surely = each.value + _SIGMAS * each.deviation < middle
-            if each.confidence != "unknown" and each.value < _SHARE * middle and surely and each.joint not in said:
+            if each.value < _SHARE * middle and surely and each.joint not in said:
                 said.add(each.joint)
                 yield Finding(
                     "weak", each.joint,
@@ -106,11 +111,13 @@ def _weak(fitted: Fitted, grips: Mapping[str, bool]) -> Iterator[Finding]:
 
 
 def _stiff(fitted: Fitted) -> Iterator[Finding]:
-    frictions = [each for each in fitted.known if each.name == "frictionloss"]
+    frictions = [each for each in fitted.known if each.name == "frictionloss" and each.confidence != "unknown"]
+    if len(frictions) < 3:
+        return
     middle = float(np.median([each.value for each in frictions]))
     for each in frictions:
         surely = each.value - _SIGMAS * each.deviation > middle
-        if each.confidence != "unknown" and each.value > max(_FRICTION * middle, middle + 0.05) and surely:
+        if each.value > max(_FRICTION * middle, middle + 0.05) and surely:
             yield Finding(
                 "stiff", each.joint,
                 f"{each.joint} moves stiffly: {each.value:.2g} Nm of dry friction, where the median is {middle:.2g}. "

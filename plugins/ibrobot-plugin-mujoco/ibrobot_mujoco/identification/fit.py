@@ -9,7 +9,7 @@ is the tightest one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import pairwise
 
 import attrs
@@ -122,14 +122,19 @@ class Fitted:
         """What is known of a parameter."""
         return next(each for each in self.known if (each.joint, each.name) == (joint, name))
 
+    def without(self, joints: Collection[str]) -> Fitted:
+        """The same, where nothing is known of these joints."""
+        known = (attrs.evolve(each, deviation=each.prior) if each.joint in joints else each for each in self.known)
+        return attrs.evolve(self, known=tuple(known))
+
 
 def rms(errors: Vector) -> float:
     """Root of the mean square."""
     return float(np.sqrt(np.mean(np.square(errors))))
 
 
-def error_of(arm: FedArm, parameters: ArmParameters, recordings: Sequence[Recording]) -> Vector:
-    """Errors of the arm that follows whole recordings from their first state [rad], shape (M, J)."""
+def error_of(arm: FedArm, parameters: ArmParameters | None, recordings: Sequence[Recording]) -> Vector:
+    """Errors of the arm that follows whole recordings from their first state [rad], shape (M, J); as `FedArm.run`."""
     reached = arm.run(parameters, recordings, np.inf)
     return np.concatenate([got - each.measured for got, each in zip(reached, recordings, strict=True)])
 

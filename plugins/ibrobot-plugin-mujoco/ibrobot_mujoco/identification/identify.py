@@ -26,6 +26,8 @@ _PUBLISHED = JointParameters(kp=8.902, damping=0.608, frictionloss=0.0524, armat
 _HELD_OUT = 4
 """One part of so many is held out."""
 _MOST_THREADS = 4
+_WORSE, _RESOLUTION_RAD = 1.1, 5e-4
+"""A fit is worse than another from this factor, and this difference: what an encoder with 4,096 steps adds [rad]."""
 _SHOWN_S = 15.0
 """Duration of the course in the report [s]."""
 
@@ -62,6 +64,8 @@ class Result:
     course: Course
     findings: Sequence[Finding]
     unknown: Sequence[tuple[str, str]]
+    unlike: Sequence[str] = ()
+    """The joints that it follows less well than the simulation before, or than delay, lag and bias alone."""
 
     def lines(self) -> list[str]:
         """The result for a terminal."""
@@ -73,6 +77,16 @@ class Result:
             f"as far), and with delay, lag and bias alone it would be {totals[BASELINE]:.2f} deg.",
             *(each.text for each in self.findings),
         ]
+        if self.unlike:
+            lines.append(
+                f"The identified simulation follows {', '.join(self.unlike)} less well than the one before, or delay, "
+                "lag and bias alone: the parameters of these joints count as unknown."
+            )
+        if _unlike(self.totals):
+            lines.append(
+                "It does so over all joints: they are not compared with each other, and the parameters are not worth "
+                "using."
+            )
         lines += [f"Unknown: {what}. To find it, {how}." for what, how in self.unknown]
         return lines
 
@@ -138,7 +152,7 @@ def identify(
 def _identify(
     arm: FedArm, recordings: Sequence[Recording], last: ArmParameters | None, rotations: int, tell: Tell
 ) -> Result:
-    before = arm.present
+    before = arm.present if arm.present is not arm.original else None
     candidates, parts = _candidates(arm), _parts(recordings)
     fits = min(rotations, len(parts))
     errors: dict[str, list[Vector]] = {BEFORE: [], BASELINE: [], AFTER: []}
@@ -160,17 +174,25 @@ def _identify(
             course = _course(arm, before, fitted, held)
     assert fitted is not None
     tell("all recordings", fits / (fits + 1))
-    final = refit(arm, recordings, fitted, candidates[0])
     every = {name: np.concatenate(each) for name, each in errors.items()}
     totals = {name: rms(each) for name, each in every.items()}
+    by_joint = {name: np.sqrt(np.mean(each**2, axis=0)) for name, each in every.items()}
+    apart = [dict(zip(by_joint, each, strict=True)) for each in zip(*by_joint.values(), strict=True)]
+    unlike = [joint for joint, each in zip(arm.robot.joint_names, apart, strict=True) if _unlike(each)]
+    final = refit(arm, recordings, fitted, candidates[0]).without(unlike)
     grips = dict(zip(arm.robot.joint_names, arm.robot.grips.tolist(), strict=True))
-    findings = findings_of(final, grips, last)
+    findings = findings_of(final, grips, last, compares=not _unlike(totals))
     return Result(
         arm.robot, seconds_of(recordings), final, _written(arm.robot, final, recordings, totals),
-        {name: np.sqrt(np.mean(each**2, axis=0)) for name, each in every.items()}, totals,
+        by_joint, totals,
         [{name: rms(each[number]) for name, each in errors.items()} for number in range(fits)],
-        course, findings, unknown_of(final),
+        course, findings, unknown_of(final), tuple(unlike),
     )  # fmt: skip
+
+
+def _unlike(errors: Mapping[str, float]) -> bool:
+    """Whether the fit is further off than the simulation before, or than delay, lag and bias alone; by rms errors."""
+    return errors[AFTER] > _WORSE * min(errors[BEFORE], errors[BASELINE]) + _RESOLUTION_RAD
 
 
 def _candidates(arm: FedArm) -> list[ArmParameters]:

@@ -136,17 +136,21 @@ class FedArm:
         return [delayed[each.begin : each.begin + each.steps] for each in windows]
 
     def run(
-        self, parameters: ArmParameters, recordings: Sequence[Recording], length_s: float = WINDOW_S
+        self, parameters: ArmParameters | None, recordings: Sequence[Recording], length_s: float = WINDOW_S
     ) -> list[Vector]:
         """The simulated positions at the times of the measurements of each recording [rad], shape (M, J).
 
         Args:
-            parameters: of the arm.
+            parameters: of the arm; None for the servos of the MJCF as they are, whose damping may be a torque that
+                counts towards their limit.
             recordings: whose commands it gets.
             length_s: about how long it is simulated from a measured state; infinite for once, from the first one.
         """
         spec = self._spec.copy()
-        apply_parameters(spec, parameters, self.robot)
+        if parameters is None:
+            parameters = self.original
+        else:
+            apply_parameters(spec, parameters, self.robot)
         model = spec.compile()
         listed = [(number, each) for number, one in enumerate(recordings) for each in self.windows(one, length_s)]
         controls = []
