@@ -65,7 +65,7 @@ def contents_of(facts: Mapping[str, Any]) -> list[ReportSection]:
             (
                 Text(
                     "± is one standard deviation. Known: within 10 %. Rough: within 30 %. Unknown: the recordings "
-                    "hardly changed the value from which the fit began.",
+                    "hardly changed the value from which the fit began, or the joint is simulated badly.",
                     "note",
                 ),
                 Table(("parameter", "joint", "value", "confidence"), tuple(_values(facts["parameters"]))),

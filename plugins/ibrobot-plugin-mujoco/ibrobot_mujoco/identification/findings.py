@@ -55,20 +55,16 @@ class Finding:
     is_fault: bool = False
 
 
-def findings_of(
-    fitted: Fitted, grips: Mapping[str, bool], last: ArmParameters | None, *, compares: bool = True
-) -> list[Finding]:
+def findings_of(fitted: Fitted, grips: Mapping[str, bool], last: ArmParameters | None) -> list[Finding]:
     """What stands out.
 
     Args:
         fitted: the fit.
         grips: joint -> whether it grips.
         last: the identification before; None without one.
-        compares: whether joints are compared with each other.
     """
     return [
-        *_delay(fitted), *_backlash(fitted), *(_weak(fitted, grips) if compares else ()),
-        *(_stiff(fitted) if compares else ()), *_holding(fitted),
+        *_delay(fitted), *_backlash(fitted), *_weak(fitted, grips), *_stiff(fitted), *_holding(fitted),
         *(_drifts(fitted, last) if last is not None else ()),
     ]  # fmt: skip
 

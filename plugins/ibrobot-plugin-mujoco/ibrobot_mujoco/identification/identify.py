@@ -65,7 +65,8 @@ class Result:
     findings: Sequence[Finding]
     unknown: Sequence[tuple[str, str]]
     unlike: Sequence[str] = ()
-    """The joints that it follows less well than the simulation before, or than delay, lag and bias alone."""
+    """The joints that it follows less well than the simulation before, or than delay, lag and bias alone; all if
+    that is so over all."""
 
     def lines(self) -> list[str]:
         """The result for a terminal."""
@@ -78,14 +79,12 @@ class Result:
             *(each.text for each in self.findings),
         ]
         if self.unlike:
+            what, whose, more = ", ".join(self.unlike), "these", ""
+            if _unlike(self.totals):
+                what, whose, more = "the arm", "all", ", and are not worth using"
             lines.append(
-                f"The identified simulation follows {', '.join(self.unlike)} less well than the one before, or delay, "
-                "lag and bias alone: the parameters of these joints count as unknown."
-            )
-        if _unlike(self.totals):
-            lines.append(
-                "It does so over all joints: they are not compared with each other, and the parameters are not worth "
-                "using."
+                f"The identified simulation follows {what} less well than the one before, or delay, lag and bias "
+                f"alone: the parameters of {whose} joints count as unknown{more}."
             )
         lines += [f"Unknown: {what}. To find it, {how}." for what, how in self.unknown]
         return lines
@@ -178,10 +177,11 @@ def _identify(
     totals = {name: rms(each) for name, each in every.items()}
     by_joint = {name: np.sqrt(np.mean(each**2, axis=0)) for name, each in every.items()}
     apart = [dict(zip(by_joint, each, strict=True)) for each in zip(*by_joint.values(), strict=True)]
-    unlike = [joint for joint, each in zip(arm.robot.joint_names, apart, strict=True) if _unlike(each)]
+    whole = _unlike(totals)
+    unlike = [joint for joint, each in zip(arm.robot.joint_names, apart, strict=True) if whole or _unlike(each)]
     final = refit(arm, recordings, fitted, candidates[0]).without(unlike)
     grips = dict(zip(arm.robot.joint_names, arm.robot.grips.tolist(), strict=True))
-    findings = findings_of(final, grips, last, compares=not _unlike(totals))
+    findings = findings_of(final, grips, last)
     return Result(
         arm.robot, seconds_of(recordings), final, _written(arm.robot, final, recordings, totals),
         by_joint, totals,
@@ -220,7 +220,7 @@ def _parts(recordings: Sequence[Recording]) -> list[list[Recording]]:
     return parts
 
 
-def _course(arm: FedArm, before: ArmParameters, after: ArmParameters, held: Sequence[Recording]) -> Course:
+def _course(arm: FedArm, before: ArmParameters | None, after: ArmParameters, held: Sequence[Recording]) -> Course:
     one = max(held, key=lambda each: each.seconds)
     shown = one.times <= _SHOWN_S
     newest = np.searchsorted(one.command_times, one.times, side="right") - 1
