@@ -53,7 +53,7 @@ _BOUNDS: Mapping[str, tuple[Callable[[Any, Any], bool], str]] = {
 
 @attrs.frozen
 class OptionWords:
-    """What forms and command lines make of an option."""
+    """How forms and command lines show an option."""
 
     label: str | None = ""
     """What forms and their errors call it; the key by default. None: it is for terminals, and not in forms."""

@@ -461,7 +461,7 @@ class RobotConfig:
     recording: RecordingConfig | None = option(None, help="recording of episodes")
     transport: TransportConfig | None = option(None, help="communication between processes and machines")
     viewer: ViewerConfig | None = option(None, help="display of the robot")
-    terminal: TerminalConfig | None = option(None, help="what reads keys and shows runs, by default the one installed")
+    terminal: TerminalConfig | None = option(None, help="what reads keys and shows the run; else the installed default")
     control: ControlConfig = option(factory=ControlConfig, help="the control loop")
     plugin_sections: Mapping[str, ComponentConfig] = not_a_key(factory=dict)
     """Name -> section defined by a plugin, for those in the file."""

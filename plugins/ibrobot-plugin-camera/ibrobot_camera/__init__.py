@@ -72,7 +72,7 @@ def ibrobot_guides() -> Iterable[GuideDescriptor]:
         "board",
         order=65,
         label="Make a board to print",
-        summary="A page with the board that a calibration shows to a camera, at true size.",
+        summary="A page with the board for the calibration of cameras, at true size.",
         make=Late("ibrobot_camera.commands.calibrate:make_board"),
         questions=Late("ibrobot_camera.commands.calibrate:board_questions"),
     )

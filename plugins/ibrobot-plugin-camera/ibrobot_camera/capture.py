@@ -154,7 +154,7 @@ class Capture:
             if capture.isOpened() and not capture.grab():
                 code = int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode(errors="replace")
                 capture.release()
-                raise self._error(f"OpenCV decodes no image of it (video format {code}); use MJPG or H.264")
+                raise self._error(f"OpenCV cannot decode its images (video format {code}); use MJPG or H.264")
             capture = cv2.VideoCapture(device.target, cv2.CAP_FFMPEG)  # from the first image on
         if not capture.isOpened():
             capture.release()

@@ -129,7 +129,8 @@ class RealSenseOptions(Calibrated):
     jpeg_quality: int = JPEG_QUALITY
     frame_id: str = option("", help="frame id of the messages; NAME_optical_frame if empty")
     info: Path | None = option(
-        None, help="calibration file as of `opencv`, instead of the intrinsics that the camera stores; for `rectify`"
+        None,
+        help="calibration file as for `opencv`, in place of the intrinsics in the camera; needed for `rectify`",
     )
 
     def devices(self) -> Mapping[str, str]:

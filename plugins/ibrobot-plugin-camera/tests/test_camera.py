@@ -344,7 +344,7 @@ class TestDevices:
         with pytest.raises(SensorError, match="is not a video that can be decoded"):
             camera(host_context("top"), str(tmp_path / "no.mp4")).open()
         (tmp_path / "vvc.avi").write_bytes(video.read_bytes().replace(b"MJPG", b"VVC1"))
-        with pytest.raises(SensorError, match=r"vvc\.avi: OpenCV decodes no image of it \(video format vvc1\); use"):
+        with pytest.raises(SensorError, match=r"vvc\.avi: OpenCV cannot decode its images \(video format vvc1\); use"):
             camera(host_context("top"), str(tmp_path / "vvc.avi")).open()
 
     def test_a_name_that_stays_is_found_by_device_or_by_usb_port(self, tmp_path, monkeypatch):

@@ -146,7 +146,7 @@ def ibrobot_reports() -> Iterable[ReportDescriptor]:
     preflights = "ibrobot_diagnose.preflight_contents"
     yield ReportDescriptor(
         PREFLIGHT_KIND,
-        summary="Whether rigs are what they were.",
+        summary="Whether a rig is what it was.",
         label="Preflights",
         command="preflight",
         reads=_is_preflight,

@@ -144,10 +144,10 @@ class Cause(ABC):
 
     @classmethod
     def to_do_with_episode(cls) -> str:
-        """What to do with an episode of a dataset that has it."""
+        """What to do with an episode of a dataset that has this cause."""
         if cls.for_episodes or "demonstration" in cls.needs:
             return cls.for_episodes or cls.remedy
-        return f"Drop it, unless runs will be like it. Before the next recordings: {cls.remedy}"
+        return f"Drop it, unless the runs will be like it. Before the next recordings: {cls.remedy}"
 
     @abstractmethod
     def test(self, window: Window, reference: Reference) -> Evidence | None:

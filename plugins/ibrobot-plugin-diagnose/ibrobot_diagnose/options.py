@@ -198,7 +198,7 @@ class Difference(Event):
     name: str = option(help="the cause")
     verdict: str = option(help="warn or fail")
     text: str = option(help="what differs, in a sentence")
-    limits: str = option(help="the number, and those from which it warns and fails")
+    limits: str = option(help="the number, and the thresholds for a warning and a failure")
     remedy: str = option(help="what to do")
 
     @override

@@ -71,7 +71,7 @@ class Preflight:
         source = self.diagnosis.source_of(number) if number is not None else None
         if source is None:
             return finding.cause.remedy
-        return f"First do what {findings[source].name} asks for: this is probably a consequence of it."
+        return f"Fix {findings[source].name} first: this is probably a consequence of it."
 
     def facts(self) -> dict[str, Any]:
         """The result as a JSON object."""

@@ -18,6 +18,8 @@ from ibrobot_diagnose.options import PREFLIGHT
 from ibrobot_diagnose.pictures import png
 
 _MOST_PICTURES = 100
+_VERDICTS = {"cannot tell": "uncertain"}
+"""Verdicts that have another name on the page, as in the first line."""
 _COLUMNS = ("verdict", "what", "how it is", "number", "warns from", "fails from")
 
 
@@ -50,7 +52,8 @@ def contents_of(facts: Mapping[str, Any], out: Path) -> list[ReportSection]:
         sections.append(ReportSection("Pictures", (Cases(pictures),)))
     rows = tuple(
         (
-            each["verdict"], each["name"], each["text"], f"{each['number']:.3g} {each['unit']}",
+            _VERDICTS.get(each["verdict"], each["verdict"]), each["name"], each["text"],
+            f"{each['number']:.3g} {each['unit']}",
             f"{each['threshold']:.3g}", "" if each["fails"] is None else f"{each['fails']:.3g}",
         )
         for each in facts["lines"]

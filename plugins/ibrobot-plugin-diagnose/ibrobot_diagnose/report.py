@@ -109,7 +109,7 @@ class Explanation:
         if shown:
             lines.append(f"How far its answers move: {'; '.join(shown[:12])}.")
         elif model.effects:
-            lines.append(f"Its answers stay the same, whichever of {len(model.effects)} changes its observations have.")
+            lines.append(f"Its answers stay the same with each of {len(model.effects)} changes of its observations.")
         return lines
 
     def lines_between(self) -> list[str]:

@@ -61,7 +61,7 @@ class HandMoved:
         self._keys = self._ctx.keys() if self._ctx.keys is not None else None
 
     def disconnect(self) -> None:
-        """Listen no more."""
+        """Stop listening to the keys."""
         self._keys = None
 
     def activate(self, now_ns: int) -> None:
@@ -79,7 +79,7 @@ class HandMoved:
 
         Args:
             positions: the device's, shape (S,).
-            complete: whether all of them were read by now; False keeps them from being where the device rests.
+            complete: whether all of them have been read; if not, they do not yet count as those at rest.
         """
         key = self._options.deadman_key
         match self._options.deadman:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 @documented
 @attrs.frozen(kw_only=True)
 class HandMovedOptions(Options):
-    """How the robot approaches and follows such a device."""
+    """How the robot approaches and follows a device that a hand moves."""
 
     ramp_velocity: float = option(
         1.0,

@@ -256,7 +256,7 @@ class Duplicate(CardCause):
         distances = np.abs(card.ways - way_of(window)[None]).max(axis=1)
         near = int(distances.argmin())
         distance, other = float(distances[near]), card.way_names[near] if card.way_names else "another episode"
-        text = f"The arm moves as in {other}, to {distance:.4f} rad: this episode is a copy of it, or nearly."
+        text = f"The arm moves as in {other}, within {distance:.4f} rad: this episode is a copy of it, or nearly."
         return Evidence(text, distance, "rad", 0.004, likelihood(distance, 0.004, 0.001))
 
 

@@ -102,7 +102,7 @@ class PictureCause(CardCause):
     threshold: ClassVar[float]
     certain: ClassVar[float]
     of_stills: ClassVar[tuple[float, float] | None] = None
-    """Threshold and certain number of the stills of a rig, if others."""
+    """The two for the stills of a rig; None if they are the same."""
 
     def measure(self, pair: Pair) -> tuple[float, str] | None:
         """How strong it is, by `threshold` and `certain`, and a sentence; None if it is uncertain."""
@@ -195,9 +195,9 @@ class CameraMoved(PictureCause):
     explains = UNSEEN | {"joint_zero", "gripper_reversed"}
     unit, threshold, certain = "pixels", 1.0, 2.0
     remedy = (
-        "Put the camera back: “Put a camera back” under “Devices” of the page shows its live picture over that of "
-        "then, and how far it still is; the report (`--out`) has both pictures. If it must stay there, record some "
-        "episodes from its new place and train again."
+        "Put the camera back: “Put a camera back” under “Devices” of `ibrobot ui` draws the reference over the live "
+        "picture, and says how far the camera still is from its place; the report (`--out`) has both pictures. If the "
+        "camera must stay there, record some episodes from its new place and train again."
     )
     for_episodes = (
         "Drop it if the camera has been put back since. If it stays where it stands now, keep it, and record more from "

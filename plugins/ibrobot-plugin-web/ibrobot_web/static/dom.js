@@ -1,5 +1,5 @@
-// Elements: h("button", {class: "primary", onclick: f}, "Text", child) makes one. Text is never markup, but for what
-// stands between backticks: that is code.
+// Elements: h("button", {class: "primary", onclick: f}, "Text", child) makes one. Text is never markup, except that
+// what stands between backticks is code.
 
 import { words } from "./words.js";
 
