@@ -36,12 +36,15 @@ class Explanation:
     @property
     def first(self) -> str:
         """The first line: the most probable cause, or that none was found, and why."""
-        diagnosis = self.diagnosis
+        diagnosis, outcome = self.diagnosis, self.window.outcome
+        tested = len(diagnosis.healthy)
         if diagnosis.findings:
             first = diagnosis.findings[0]
-            weak = "Nothing is wrong with the set-up; more or better data is what helps: " if first.cause.weak else ""
-            return weak + first.evidence.text
-        tested, outcome = len(diagnosis.healthy), self.window.outcome
+            if not first.cause.weak:
+                return first.evidence.text
+            if outcome == "success":
+                return f"Nothing is wrong: the run is a success, though {first.evidence.text}"
+            return f"Nothing is wrong with the set-up; more or better data is what helps: {first.evidence.text}"
         lacking = sum("--data" in why for _, why in diagnosis.untested)
         if outcome == "success":
             return f"Nothing is wrong: the run is a success, and none of the {tested} causes tested was found."

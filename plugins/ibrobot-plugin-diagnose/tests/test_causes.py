@@ -22,6 +22,7 @@ from ibrobot_diagnose.causes import all_causes
 from ibrobot_diagnose.causes.data import UnseenStates
 from ibrobot_diagnose.causes.motion import AnswersTremble, SmoothingAverages
 from ibrobot_diagnose.causes.others import TOOLS
+from ibrobot_diagnose.causes.pictures import pairs
 from ibrobot_diagnose.commands import check
 from ibrobot_diagnose.diagnosis import diagnose
 from ibrobot_diagnose.report import Explanation
@@ -555,7 +556,23 @@ def test_weak_policy_comes_after_whatever_is_wrong_with_the_set_up(data):
     assert Explanation.of(window, data, found).first == "A joint squeaks."
 
 
-@pytest.mark.parametrize("share", [0.5, 1.0])
+@pytest.mark.parametrize(
+    ("outcome", "begins"), [("success", "Nothing is wrong: "), ("failure", "Nothing is wrong with ")]
+)
+def test_success_needs_no_more_data(outcome, begins, data):
+    """Though its arm went where the data was not, as does that of any run that is compared with one other alone."""
+
+    class Errs(Squeaks):
+        name, weak = "errs", True
+
+    window = window_of(Run(cameras=(), outcome=outcome))
+    first = Explanation.of(window, data, diagnose(window, data, [Errs()])).first
+    assert first.startswith(begins)
+    assert first.endswith("A joint squeaks.")
+    assert ("more or better data" in first) == (outcome == "failure")
+
+
+@pytest.mark.parametrize("share", [0.5, 0.8, 1.0])
 def test_colours_are_exchanged_in_nearly_all_pictures(share, data):
     """A scene of some pictures alone may fit the data so by chance."""
 
@@ -582,11 +599,28 @@ def test_camera_on_the_arm_is_compared_where_the_arm_stands_alike(data):
     assert "camera_moved" not in names_of(run, on_arm)
     hidden = window_of(Run(seed=9323, outcome="failure", picture=of_top(lambda shown: shown * 0 + 50), **ONE))
     assert "picture_covered" in names_of(hidden, on_arm)
-    away: dict[str, Any] = {"start": (0.9,) * 4, "seconds": 3, "cameras": ("top",), "camera_hz": 5.0}
+    away: dict[str, Any] = {"start": (2.5,) * 4, "seconds": 3, "cameras": ("top",), "camera_hz": 5.0}
     elsewhere = window_of(Run(seed=9324, outcome="failure", **away))
     assert "picture_covered" not in names_of(elsewhere, on_arm)
     hidden = window_of(Run(seed=9324, outcome="failure", picture=of_top(lambda shown: shown * 0 + 50), **away))
-    assert "picture_covered" in names_of(hidden, on_arm), "though the arm never stands as in the data"
+    assert on_arm.card is not None
+    (pair,) = pairs(hidden, on_arm.card)
+    assert pair.at_like_poses() is None, "the arm never stands as in the data"
+    assert "picture_covered" in names_of(hidden, on_arm)
+
+
+@pytest.mark.parametrize("share", [0.6, 1.0])
+def test_cameras_are_exchanged_in_nearly_all_pictures(share, data):
+    """Some pictures alone may look like the other camera's by chance."""
+    windows = [
+        window_of(Run(seed=9331, outcome="failure", exchanged=exchanged, **{**BOTH, "seconds": 8}))
+        for exchanged in (False, True)
+    ]
+    assert data.card is not None
+    for one, other in zip(*(pairs(each, data.card) for each in windows), strict=True):
+        count = round(share * len(one.camera.pictures))
+        one.camera.pictures[:count] = other.camera.pictures[:count]
+    assert ("cameras_exchanged" in names_of(windows[0], data)) == (share == 1)
 
 
 def test_joint_that_the_cameras_hardly_see_has_no_shifted_zero(data):

@@ -260,6 +260,7 @@ def test_run_is_compared_with_one_that_worked(folder):
     good = record_run(folder / "good" / "episode_000001", Run(seed=22, seconds=4))
     (explained,) = json.loads(run_here("explain", folder / "runs:1", "--against", good, "--json").stdout)
     assert explained["causes"][0]["name"] == "picture_dark"
+    assert explained["lines"][-1] == f"“The data” stands here for what it is compared with: 1 run of {good}."
     both = run_here("explain", folder / "runs:1", "--against", good, "--data", folder / "demos")
     assert both.returncode == 2
     assert "exclude each other" in both.stderr

@@ -70,6 +70,16 @@ def test_page_is_one_file_without_network_and_well_formed(tmp_path):
     assert "over friction" not in text, "it never varies"
 
 
+def test_wide_plots_are_scrolled_on_a_phone_since_smaller_texts_cannot_be_read(tmp_path):
+    text = as_page(tmp_path, made())
+    widths = re.findall(r"<svg [^>]*style=\"min-width:([0-9.]+)px;max-width:([0-9.]+)px\"", text)
+    assert widths
+    assert all(float(least) == pytest.approx(0.8 * float(most)) for least, most in widths)
+    phone = 390 - 2 * 24
+    within = re.findall(r'<div class="scroll" tabindex="0"><svg [^>]*min-width:([0-9.]+)px', text)
+    assert len(within) == sum(float(least) > phone for least, _ in widths)
+
+
 def test_page_escapes_names_and_faults(tmp_path):
     text = as_page(tmp_path, made(HOSTILE))
     assert HOSTILE not in text

@@ -86,6 +86,17 @@ TITLE = """async (title) => {
 }"""
 """What the card of a job with a title shows as its title."""
 
+REPORTED = """async ([title, fix]) => {
+  const { View } = await import("/static/ui/reports.js");
+  const view = new View({ drives: true }, { name: "report-check", title: "Checks", report: "check" });
+  view.mount(document.createElement("div"));
+  view.sections = [{ title: "demos", blocks: [] }, { title, blocks: [] }];
+  view.draw();
+  const [button] = view.fixes({ title: "1. a", episode: "a", fixes: [fix] });
+  return [view.body.querySelector("h3").textContent, button.textContent, button.ariaLabel];
+}"""
+"""What a report shows as a heading, and a button that mends an episode with what it is called."""
+
 LATER = """async () => {
   const { words } = await import("/static/words.js");
   for (let i = 0; i < 5000; i += 1) words(`${i / 100} rad`);
@@ -127,6 +138,10 @@ def test_no_english_sentence_is_left_in_a_chinese_browser(tmp_path: Path) -> Non
             ("Explain b", "分析失败 b"),
         ):
             assert page.evaluate(TITLE, title) == shown
+        second = "2. The guard held the arm back in 55 % of the run, mostly between gripper and table."
+        heading, button, called = page.evaluate(REPORTED, [second, {"label": "Drop", "does": "delete"}])
+        assert heading.startswith("2. 防碰保护在 55 % 的运行时间里")
+        assert called == f"{button}: 1. a", "a person who speaks what stands on the button finds it"
         assert page.evaluate(LATER) == "数据集"
         browser.close()
     assert errors == []

@@ -72,7 +72,7 @@ def _block(out: Path, block: Text | Table | Plots | Cases) -> str:
             body = "".join(tag("tr", "".join(tag("td", escape(cell)) for cell in row)) for row in rows)
             return tag("div", tag("table", top + body), class_="scroll")
         case Plots((picture,)):
-            return picture
+            return tag("div", picture, class_="scroll", tabindex=0)
         case Plots(pictures):
             return tag("div", "".join(pictures), class_="panels")
         case Cases(cases):

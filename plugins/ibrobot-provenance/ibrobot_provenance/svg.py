@@ -49,9 +49,10 @@ def tag(name: str, text: str = "", **attributes: Any) -> str:
 
 
 def svg(width: float, height: float, parts: Sequence[str], title: str) -> str:
-    """A picture that scales with the page, with a title for screen readers."""
+    """A picture that scales with the page while its texts can be read, with a title for screen readers."""
     inner = tag("title", escape(title)) + "".join(parts)
-    return tag("svg", inner, viewBox=f"0 0 {width} {height}", style=f"max-width:{width}px", role="img")
+    style = f"min-width:{0.8 * width:g}px;max-width:{width:g}px"
+    return tag("svg", inner, viewBox=f"0 0 {width} {height}", style=style, role="img")
 
 
 def caption(x: float, y: float, text: str, anchor: str = "middle", class_: str = "") -> str:

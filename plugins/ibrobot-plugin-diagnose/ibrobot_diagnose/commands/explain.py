@@ -107,7 +107,11 @@ def explain_episode(
         from ibrobot_diagnose.contents import write_report
 
         write_report(folder_of(options, episode), explanation, episode)
-    return {**explanation.facts(ticks=options.ticks), "lines": explanation.lines()}
+    lines = explanation.lines()
+    if card is not None and options.against is not None:
+        runs = "1 run" if card.episodes == 1 else f"{card.episodes} runs"
+        lines.append(f"“The data” stands here for what it is compared with: {runs} of {options.against}.")
+    return {**explanation.facts(ticks=options.ticks), "lines": lines}
 
 
 def folder_of(options: ExplainOptions, episode: Path) -> Path:

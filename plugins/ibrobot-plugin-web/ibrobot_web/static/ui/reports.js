@@ -1,6 +1,7 @@
 // View: reports of one kind on folders with results, e.g. evaluations, and the recordings that they name.
 
 import { h, problem, refresh, replace, row, say, scroll, table, toast, when } from "../dom.js";
+import { words } from "../words.js";
 import { Player } from "./player.js";
 
 const SVG = "http://www.w3.org/2000/svg";
@@ -86,7 +87,7 @@ export class View {
 
   draw() {
     refresh(this.body, [this.sections, [...this.mended], this.ui.drives], () => this.sections.map(({ title, blocks }, i) => (
-      h("section", { "aria-label": title }, i ? h("h3", {}, title) : null, blocks.map((block) => this.block(block, title))))));
+      h("section", { "aria-label": numbered(title) }, i ? h("h3", {}, numbered(title)) : null, blocks.map((block) => this.block(block, title))))));
   }
 
   block(block, section) {
@@ -94,7 +95,9 @@ export class View {
       case "text": return block.role === "title" ? h("h4", {}, block.text) : h("p", { class: block.role }, block.text);
       case "table": return scroll(`${section}: table`, table(block.columns, block.rows.map(([first, ...cells]) => (
         row([first, ...cells.map((cell) => h("td", { class: cell.length > 40 ? "text" : "" }, cell))])))));
-      case "plots": return h("div", { class: block.pictures.length > 1 ? "plotted several" : "plotted" }, block.pictures.map(picture));
+      case "plots": return block.pictures.length > 1
+        ? h("div", { class: "plotted several" }, block.pictures.map(picture))
+        : scroll(`${section}: plot`, h("div", { class: "plotted" }, block.pictures.map(picture)));
       case "cases": return h("div", { class: "columns cases" }, block.cases.map((each) => this.case(each)));
       default: return null;
     }
@@ -122,7 +125,7 @@ export class View {
         h("button", { disabled: !this.ui.drives, "aria-label": `Undo what was done to ${title}`, onclick: () => this.undo(title) }, "Undo")];
     }
     return episode ? fixes.map((fix) => h("button", {
-      class: fix.does === "delete" ? "danger" : "", disabled: !this.ui.drives, "aria-label": `${fix.label}: ${title}`,
+      class: fix.does === "delete" ? "danger" : "", disabled: !this.ui.drives, "aria-label": `${words(fix.label)}: ${title}`,
       onclick: () => this.mend(title, episode, fix),
     }, fix.label)) : [];
   }
@@ -200,6 +203,9 @@ export class View {
   }
 }
 
+// A heading with a number, in the language of the browser.
+const numbered = (title) => title.replace(/^(\d+\. )(.+)$/, (_, number, text) => number + words(text));
+
 const paragraphs = (text) => text.split("\n").filter(Boolean).map((line) => h("p", {}, line));
 
 async function copy(text) {
@@ -215,7 +221,7 @@ async function copy(text) {
 function picture(text) {
   const made = shape(new DOMParser().parseFromString(text, "image/svg+xml").documentElement);
   const width = made?.getAttribute("viewBox")?.split(" ")[2];
-  if (width) made.style.maxWidth = `${Number(width)}px`;
+  if (width) Object.assign(made.style, { maxWidth: `${Number(width)}px`, minWidth: `${0.8 * width}px` }); // smaller texts cannot be read
   return made;
 }
 
