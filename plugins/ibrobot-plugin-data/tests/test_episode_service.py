@@ -67,7 +67,10 @@ def test_a_list_of_topics_must_have_the_contracts(runs: Runs):
 @pytest.mark.parametrize(
     ("root", "message"),
     [
-        ("/proc/none", r"recording.root: .* (cannot be written: .*; choose another root|is not writable for this user)$"),
+        (
+            "/proc/none",
+            r"recording.root: .* (cannot be written: .*; choose another root|is not writable for this user)$",
+        ),
         ("file/below", r"recording.root: .*/file is a file, not a folder"),
     ],
 )
