@@ -269,14 +269,6 @@ CLAIMS = (
     ),
     Claim(
         "preflight_photographs",
-        "on the photographs of real scenes that its measures were chosen on, and videos of a real robot, `ibrobot"
-        " preflight` accuses at most 1 in 200 unchanged ones",
-        "docs/how-to/check-a-rig.md",
-        "preflight_photographs.py PHOTOGRAPHS/tuned --unchanged 6",
-        "the photographs that the script names: `run.py --photographs FOLDER`",
-    ),
-    Claim(
-        "preflight_fresh_photographs",
         "on photographs of real scenes that were not looked at before, `ibrobot preflight` accuses at most 1 in 200"
         " unchanged ones, and calls none unmoved that moved by 20 pixels or 3 degrees",
         "docs/how-to/check-a-rig.md",
@@ -385,7 +377,7 @@ def main() -> int:
     parser.add_argument("--page", action="store_true", help="write the table of the page")
     parser.add_argument("--lerobot", metavar="PYTHON", help="an interpreter with LeRobot")
     parser.add_argument("--dataset", metavar="DATASET", help="recordings of a real arm")
-    parser.add_argument("--photographs", metavar="FOLDER", help="with the folders `tuned` and `fresh`")
+    parser.add_argument("--photographs", metavar="FOLDER", help="with the folder `fresh`")
     asked = parser.parse_args()
     known = {claim.name: claim for claim in CLAIMS}
     if unknown := [name for name in asked.names if name not in known]:
