@@ -114,8 +114,8 @@ def test_an_episode_that_cannot_tell_is_refused_with_the_reason(
 def answers(robot: Path | str, episode: Path, **changes: str | bool) -> dict[str, str | bool]:
     """Of an operator on the page."""
     return {
-        "robot": str(robot), "episode": str(episode), "camera": "wrist", "on": "gripper_link", "board_on": "", "board_at": "",
-        "squares": "8 x 6", "square": "25", "simulated": False, **changes,
+        "robot": str(robot), "episode": str(episode), "camera": "wrist", "on": "gripper_link", "board_on": "",
+        "board_at": "", "squares": "8 x 6", "square": "25", "simulated": False, **changes,
     }  # fmt: skip
 
 
