@@ -171,7 +171,7 @@ def test_a_run_that_counts_ports_moves_nothing_and_says_which_is_which(bench: Be
     code, said = bench.run("launch", "desk.yaml", "--mode", "teleop", "--headless", "--duration", 1)
     assert code == 1, said
     assert f"{follower}: this is another arm: its adapter has the USB serial number LEADER" in said
-    assert "`port: serial:FOLLOWER`, which finds it wherever it is" in said
+    assert "port: serial:FOLLOWER, which finds it wherever it is" in said
     assert goals(bench) == before
 
 
@@ -195,7 +195,7 @@ def test_the_page_says_which_is_which(bench: Bench) -> None:
         page.get_by_role("button", name="Launch", exact=True).click()
         said = page.locator(".job .problem").first.inner_text()
         assert "this is another arm: its adapter has the USB serial number LEADER" in said
-        assert "`port: serial:FOLLOWER`, which finds it wherever it is" in said
+        assert "port: serial:FOLLOWER, which finds it wherever it is" in said
         assert goals(bench) == before
         # The guides show which is which.
         page.get_by_role("link", name="Devices", exact=True).click()
