@@ -102,8 +102,8 @@ class PoolSuite(Suite[Pool]):
     def test_job_whose_process_is_killed_is_run_again(self, tmp_path: Path) -> None:
         """A killed process costs no job, and its progress does not count."""
         counts: list[int] = []
-        with self.opened(2) as pool:
-            done = pool.run([Job(die_once, Order(number, str(tmp_path))) for number in range(3)], counts.append)
+        jobs = [Job(die_once, Order(number, str(tmp_path))) for number in range(3)]
+        with self.opened(2) as pool, closing(pool.run(jobs, counts.append)) as done:
             assert sorted(each.result() for each in done) == [0, 1, 2]
         assert counts[-1] == 3, "the progress of a process that died does not count"
 
@@ -121,8 +121,9 @@ class PoolSuite(Suite[Pool]):
     def test_own_processes_run_one_job_each_in_the_same_folder(self, tmp_path: Path, monkeypatch: Any) -> None:
         """A job with `own_process` gets a new process, in the folder of the caller."""
         monkeypatch.chdir(tmp_path)
-        with self.opened(1) as pool:
-            done = [each.result() for each in pool.run([Job(process, Order(n), own_process=True) for n in range(3)])]
+        jobs = [Job(process, Order(number), own_process=True) for number in range(3)]
+        with self.opened(1) as pool, closing(pool.run(jobs)) as running:
+            done = [each.result() for each in running]
         assert len({pid for pid, _ in done}) == 3
         assert {folder for _, folder in done} == {str(tmp_path.resolve())}
 
