@@ -37,8 +37,11 @@ def _uint8s(value: ArrayLike) -> NDArray[np.uint8]:
 
 
 JOINT_STATES = "/joint_states"
+"""The topic of every `JointState`."""
 ROBOT_STATUS = "/robot_status"
+"""The topic of every `RobotStatus`."""
 DIAGNOSTICS = "/diagnostics"
+"""The topic of every `DiagnosticArray`."""
 RUN_TOPICS = (JOINT_STATES, ROBOT_STATUS, DIAGNOSTICS)
 """The topics that every run publishes."""
 MODEL_ANSWERS = "/model_answers"

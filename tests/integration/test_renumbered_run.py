@@ -171,7 +171,7 @@ def test_a_run_that_counts_ports_moves_nothing_and_says_which_is_which(bench: Be
     code, said = bench.run("launch", "desk.yaml", "--mode", "teleop", "--headless", "--duration", 1)
     assert code == 1, said
     assert f"{follower}: this is another arm: its adapter has the USB serial number LEADER" in said
-    assert "port: serial:FOLLOWER, which finds it wherever it is" in said
+    assert "`port: serial:FOLLOWER`, which finds it wherever it is" in said
     assert goals(bench) == before
 
 
