@@ -5,26 +5,13 @@ from __future__ import annotations
 import threading
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable
-from pathlib import Path
-from typing import Any, overload
 
 import attrs
 
 from ibrobot_core.clock import Clock
-from ibrobot_core.convert import no_files
 from ibrobot_core.errors import TransportError
 from ibrobot_core.messages import Message
-from ibrobot_core.services import Plain, Service
-
-
-@attrs.frozen(eq=False)
-class _Server[Q, A]:
-    """A service, and what answers its calls."""
-
-    service: Service[Q, A]
-    handler: Callable[[Q], A]
-    files: Callable[[str], Path]
-
+from ibrobot_core.services import ServiceTable
 
 type Wants = Callable[[str], bool]
 """Whether a subscription to every topic gets the messages of one; by default it gets all."""
@@ -80,7 +67,7 @@ class Subscription:
             self._bus._subscriptions[self.topic] = others
 
 
-class Bus:
+class Bus(ServiceTable):
     """Publish and subscribe within a process. Publishing never blocks on a subscriber.
 
     Times of receipt are taken under the bus lock. So for a time from `snapshot_ns`, the queues contain every message
@@ -88,8 +75,8 @@ class Bus:
     """
 
     def __init__(self, clock: Clock) -> None:
+        super().__init__()
         self.clock = clock
-        self._lock = threading.RLock()
         self._subscriptions: defaultdict[str, list[Subscription]] = defaultdict(list)
         """Subscriptions by topic; the empty key has those of all topics."""
         self._types: dict[str, str] = {}
@@ -98,7 +85,6 @@ class Bus:
         """Types that the configuration, or what reads a topic, states."""
         self._latched: dict[str, Received] = {}
         self._counts: dict[str, int] = {}
-        self._servers: dict[str, _Server[Any, Any]] = {}
 
     def expect(self, topic: str, *types: str) -> None:
         """State the types that a topic may carry, for the rest of the run; messages of other types are refused.
@@ -196,66 +182,6 @@ class Bus:
             lost = {topic: sum(each.lost.total() for each in every) for topic, every in self._subscriptions.items()}
             return {topic or "*": number for topic, number in lost.items() if number}
 
-    def serve[Q, A](
-        self, service: Service[Q, A], handler: Callable[[Q], A], files: Callable[[str], Path] = no_files
-    ) -> None:
-        """Answer calls of a service with `handler`, in the caller's thread.
-
-        Args:
-            service: the service.
-            handler: computes the answer to a request, which fits the service's class.
-            files: finds the file that a text in a plain request names; see `Service.read`.
-
-        Raises:
-            TransportError: if the service is served already.
-        """
-        with self._lock:
-            if service.name in self._servers:
-                raise TransportError(f"service {service.name} is served already")
-            self._servers[service.name] = _Server(service, handler, files)
-
-    def unserve(self, service: Service[Any, Any] | str) -> None:
-        """Stop serving a service; does nothing if it is not served."""
-        with self._lock:
-            self._servers.pop(_name(service), None)
-
-    def serves(self, service: Service[Any, Any] | str) -> bool:
-        """Whether a service is served."""
-        with self._lock:
-            return _name(service) in self._servers
-
-    def services(self) -> dict[str, Service[Any, Any]]:
-        """The served services by name, sorted."""
-        with self._lock:
-            return {name: server.service for name, server in sorted(self._servers.items())}
-
-    @overload
-    def call[Q, A](self, service: Service[Q, A], request: Q) -> A: ...
-
-    @overload
-    def call[A](self, service: Service[Any, A], request: Plain = None) -> A: ...
-
-    @overload
-    def call(self, service: str, request: Any = None) -> Any: ...
-
-    def call(self, service: Service[Any, Any] | str, request: Any = None) -> Any:
-        """Call a service, given by its declaration or its name, with an object of its request's class or plain data.
-
-        Raises:
-            TransportError: if it has no server.
-            RequestError: for plain data that does not fit.
-        """
-        name = _name(service)
-        with self._lock:
-            server = self._servers.get(name)
-        if server is None:
-            raise TransportError(f"nobody serves {name}; served: {', '.join(self.services()) or 'nothing'}")
-        return server.handler(server.service.read(request, server.files))
-
 
 def _any(types: Iterable[str]) -> str:
     return " or ".join(sorted(types))
-
-
-def _name(service: Service[Any, Any] | str) -> str:
-    return service if isinstance(service, str) else service.name

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 import re
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import UnionType
-from typing import Any
+from typing import Any, overload
 
 import attrs
 
 from ibrobot_core.convert import MOST, Converter, Faults, Key, error_message, no_files, shown
-from ibrobot_core.errors import RequestError
+from ibrobot_core.errors import RequestError, TransportError
 from ibrobot_core.options import fields
 
 type Plain = bool | int | float | str | Sequence[Plain] | Mapping[str, Plain] | None
@@ -107,6 +108,79 @@ class Service[Q, A]:
         raise RequestError(f"{self.name}: {Faults(faults)}")
 
 
+@attrs.frozen(eq=False)
+class _Server[Q, A]:
+    """A service, and what answers its calls."""
+
+    service: Service[Q, A]
+    handler: Callable[[Q], A]
+    files: Callable[[str], Path]
+
+
+class ServiceTable:
+    """The services of a process, by name: what serves and calls them. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self._servers: dict[str, _Server[Any, Any]] = {}
+
+    def serve[Q, A](
+        self, service: Service[Q, A], handler: Callable[[Q], A], files: Callable[[str], Path] = no_files
+    ) -> None:
+        """Answer calls of a service with `handler`, in the caller's thread.
+
+        Args:
+            service: the service.
+            handler: computes the answer to a request, which fits the service's class.
+            files: finds the file that a text in a plain request names; see `Service.read`.
+
+        Raises:
+            TransportError: if the service is served already.
+        """
+        with self._lock:
+            if service.name in self._servers:
+                raise TransportError(f"service {service.name} is served already")
+            self._servers[service.name] = _Server(service, handler, files)
+
+    def unserve(self, service: Service[Any, Any] | str) -> None:
+        """Stop serving a service; does nothing if it is not served."""
+        with self._lock:
+            self._servers.pop(_name(service), None)
+
+    def serves(self, service: Service[Any, Any] | str) -> bool:
+        """Whether a service is served."""
+        with self._lock:
+            return _name(service) in self._servers
+
+    def services(self) -> dict[str, Service[Any, Any]]:
+        """The served services by name, sorted."""
+        with self._lock:
+            return {name: server.service for name, server in sorted(self._servers.items())}
+
+    @overload
+    def call[Q, A](self, service: Service[Q, A], request: Q) -> A: ...
+
+    @overload
+    def call[A](self, service: Service[Any, A], request: Plain = None) -> A: ...
+
+    @overload
+    def call(self, service: str, request: Any = None) -> Any: ...
+
+    def call(self, service: Service[Any, Any] | str, request: Any = None) -> Any:
+        """Call a service, given by its declaration or its name, with an object of its request's class or plain data.
+
+        Raises:
+            TransportError: if it has no server.
+            RequestError: for plain data that does not fit.
+        """
+        name = _name(service)
+        with self._lock:
+            server = self._servers.get(name)
+        if server is None:
+            raise TransportError(f"nobody serves {name}; served: {', '.join(self.services()) or 'nothing'}")
+        return server.handler(server.service.read(request, server.files))
+
+
 def _too_much(request: object, limits: RequestLimits) -> list[tuple[Key, str]]:
     """The first value that is beyond the limits, or is no plain data, with its fault."""
     left = limits.values
@@ -147,3 +221,7 @@ def _misfit(value: object, limits: RequestLimits) -> str:
 def _key_misfit(key: object, limits: RequestLimits) -> str:
     """Why a key cannot be part of a request; empty if it can."""
     return _misfit(key, limits) if isinstance(key, str) else f"{shown(key)} is no key: a key is a text"
+
+
+def _name(service: Service[Any, Any] | str) -> str:
+    return service if isinstance(service, str) else service.name

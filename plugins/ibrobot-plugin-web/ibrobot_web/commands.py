@@ -1,10 +1,12 @@
-"""Commands of pages, carried out in the host: each is a service of the run or its emergency stop."""
+"""Commands of pages, received and carried out in the host: each is a service of the run or its emergency stop."""
 
 from __future__ import annotations
 
 import logging
 import queue
+import select
 import threading
+import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -13,13 +15,14 @@ import attrs
 
 from ibrobot_core.api import IbrobotError, PlanningError, seconds
 from ibrobot_core.app import (
+    Child,
     Pulse,
     RunView,
     error_text,
     raise_thread_priority,
 )
 from ibrobot_web import messages
-from ibrobot_web.messages import RunCommand, Sent, clock_ns
+from ibrobot_web.messages import Pages, Release, RunCommand, Sent, StopRun, clock_ns, from_server
 from ibrobot_web.teleop import JOG, RELEASE, Jog, Released
 
 Reply = Callable[[Mapping[str, Any]], None]
@@ -38,6 +41,7 @@ _BEGINS = (f"{_RECORD}/start", f"{_RECORD}/redo")
 _BLOCKED_S = 6.0
 """Time without a sign of life of a thread that stops go through after which the run ends [s]; control may take 5 s to
 answer."""
+_POLL_S = 0.1
 _TRIAL = -1
 """The number of a stop that is only tried out."""
 _NS_PER_MS = 1_000_000
@@ -180,6 +184,83 @@ class Commands:
         ends = ("discard", None) if status.waiting else ("stop", "unknown")
         bus.call(f"{_RECORD}/{ends[0]}", ends[1])
         _log.warning("the page was closed or loaded again, and nobody went on: its episode has ended, not judged")
+
+
+class Receiver:
+    """Takes the messages of the page's server, in a thread without which the page's STOP would be deaf.
+
+    Args:
+        child: the server's process.
+        session: the run.
+        commands: carries out commands.
+        on_pages: called when pages come or go, or show other channels.
+        on_failure: called with the error that ended the thread.
+
+    Attributes:
+        open: set to False to end the thread, as the end of the server does.
+        alive_s: when the server last gave a sign of life, by the monotonic clock [s].
+        death: why the server is dead; empty while it lives.
+    """
+
+    def __init__(
+        self, child: Child, session: RunView, commands: Commands, on_pages: Callable[[Pages], None],
+        on_failure: Callable[[Exception], None],
+    ) -> None:  # fmt: skip
+        self._child = child
+        self._session = session
+        self._commands = commands
+        self._on_pages = on_pages
+        self._on_failure = on_failure
+        self.open = True
+        self.alive_s = time.monotonic()
+        self.death = ""
+        self._thread = threading.Thread(target=self._receive, name="web commands", daemon=True)
+        self._thread.start()
+
+    def join(self) -> None:
+        """Wait for the end of the thread."""
+        self._thread.join()
+
+    def _receive(self) -> None:
+        raise_thread_priority()
+        pulse = Pulse("commands of the page", _BLOCKED_S)
+        self._session.pulses.add(pulse)
+        died = False
+        try:
+            while not self._child.channel.closed and self.open:
+                pulse.beat()
+                self._take()
+            died = self.open
+        except Exception as error:  # noqa: BLE001 - reported to the run, which ends
+            self._on_failure(error)
+        self._session.pulses.discard(pulse)
+        if self.open:
+            self._commands.take(Sent(None, None, Release()))
+        if died:
+            self.death = f"the page's server died: {self._child.cause()}"
+
+    def _take(self) -> None:
+        """Wait for messages of the server, and take them."""
+        try:
+            if not select.select([self._child.channel.fileno()], [], [], _POLL_S)[0]:
+                return
+            arrived = self._child.receive()
+        except (OSError, ValueError):  # closed meanwhile
+            return
+        self.alive_s = time.monotonic()
+        for each in arrived:
+            try:
+                message = from_server(each)
+            except (ValueError, IbrobotError) as error:
+                _log.warning("dropped a message: %s", error)
+                continue
+            match message:
+                case Pages():
+                    self._on_pages(message)
+                case StopRun(number):
+                    self._commands.stop(number)
+                case Sent():
+                    self._commands.take(message)
 
 
 def _waiting[T](waiting: queue.SimpleQueue[T]) -> list[T]:

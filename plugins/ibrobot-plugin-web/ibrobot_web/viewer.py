@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import select
 import socket
 import threading
 import time
@@ -15,11 +14,11 @@ import attrs
 from ibrobot_terminal.agent_calls import AgentCalls
 
 from ibrobot_core.api import Context, ContractError, IbrobotError, Viewer
-from ibrobot_core.app import Child, ComponentFailed, Pulse, RunView, Subscription, error_text, raise_thread_priority
-from ibrobot_web.commands import Commands
+from ibrobot_core.app import Child, ComponentFailed, RunView, Subscription, error_text
+from ibrobot_web.commands import Commands, Receiver
 from ibrobot_web.desktop import open_browser
 from ibrobot_web.link import FIRST_PICTURE, PLAN, SAMPLES, STATE, STATUS, FrameSender
-from ibrobot_web.messages import Pages, Release, Sent, StopRun, from_server
+from ibrobot_web.messages import Pages
 from ibrobot_web.objects import SceneObjects, mounts
 from ibrobot_web.options import WebOptions
 from ibrobot_web.pictures import PICTURES, to_payload
@@ -28,9 +27,6 @@ from ibrobot_web.status import LogLines, episode_json, numbers_of, plan_json, st
 _MODULE = "ibrobot_web.server.process"
 _START_S = 30.0
 _END_S = 3.0
-_POLL_S = 0.1
-_BLOCKED_S = 6.0
-"""Time without a sign of life of the thread that receives commands after which the run ends [s]."""
 _SILENT_S = 5.0
 """Time without a sign of life of the server after which the run ends [s]."""
 _STATUS_S, _SAMPLES_S, _TOPICS_S = 0.25, 0.1, 1.0
@@ -92,10 +88,8 @@ class WebViewer(Viewer):
         self._samples: dict[str, Subscription] = {}
         self._due: dict[int, float] = {}
         self._next_s = 0.0
-        self._alive_s = time.monotonic()
         self._commands = Commands(session, self.finish, self._child.channel.send, self._fail)
-        self._thread = threading.Thread(target=self._receive, args=(self._child,), name="web commands", daemon=True)
-        self._thread.start()
+        self._receiver = Receiver(self._child, session, self._commands, self._take_pages, self._fail)
         if self._options.browser:
             open_browser(self.url)
 
@@ -104,10 +98,11 @@ class WebViewer(Viewer):
         if self._child is None or self._finish.is_set():
             return False
         now_s = time.monotonic()
-        if not self._dead and now_s - self._alive_s > _SILENT_S:
-            self._dead = f"the page's server has been silent for {_SILENT_S:g} s: its STOP would not be heard"
-        if self._dead:
-            raise ComponentFailed(self._dead)
+        dead = self._dead or self._receiver.death
+        if not dead and now_s - self._receiver.alive_s > _SILENT_S:
+            dead = f"the page's server has been silent for {_SILENT_S:g} s: its STOP would not be heard"
+        if dead:
+            raise ComponentFailed(dead)
         if now_s < self._next_s:
             self._frames.flush()
             return True
@@ -129,6 +124,8 @@ class WebViewer(Viewer):
         child, self._child = self._child, None
         if child is None:
             return
+        if self.url:
+            self._receiver.open = False
         try:
             if self.url and self.pages:
                 self._send(STATUS, {**self._status(), "ended": True})
@@ -149,7 +146,7 @@ class WebViewer(Viewer):
         child.channel.close()
         child.end()
         if self.url:
-            self._thread.join()
+            self._receiver.join()
         self.url = self.watch_url = ""
         self.pages = 0
 
@@ -176,45 +173,9 @@ class WebViewer(Viewer):
             raise ComponentFailed(f"the page's server was not ready after {_START_S:g} s")
         return message["url"], message["watch_url"]
 
-    def _receive(self, child: Child) -> None:
-        """Take messages until the server or the viewer ends. Without this thread the page's STOP would be deaf."""
-        raise_thread_priority()
-        pulse = Pulse("commands of the page", _BLOCKED_S)
-        self._session.pulses.add(pulse)
-        try:
-            while not child.channel.closed and self._child is child:
-                pulse.beat()
-                self._take(child)
-        except Exception as error:  # noqa: BLE001 - reported to the run, which ends
-            self._fail(error)
-        self._session.pulses.discard(pulse)
-        if self._child is child:
-            self._commands.take(Sent(None, None, Release()))
-            self._dead = self._dead or f"the page's server died: {child.cause()}"
-
-    def _take(self, child: Child) -> None:
-        """Wait for messages of the server, and take them."""
-        try:
-            if not select.select([child.channel.fileno()], [], [], _POLL_S)[0]:
-                return
-            messages = child.receive()
-        except (OSError, ValueError):  # closed meanwhile
-            return
-        self._alive_s = time.monotonic()
-        for each in messages:
-            try:
-                message = from_server(each)
-            except (ValueError, IbrobotError) as error:
-                self._ctx.log.warning("dropped a message: %s", error)
-                continue
-            match message:
-                case Pages():
-                    self._wanted, self.pages = message.wanted, message.count
-                    self._due = {}
-                case StopRun(number):
-                    self._commands.stop(number)
-                case Sent():
-                    self._commands.take(message)
+    def _take_pages(self, pages: Pages) -> None:
+        self._wanted, self.pages = pages.wanted, pages.count
+        self._due = {}
 
     def _fail(self, error: Exception) -> None:
         """End the run, whose page can no longer stop the robot."""

@@ -16,9 +16,11 @@ from typing import Any
 import attrs
 from aiohttp import WSMsgType, web
 
+from ibrobot_core.app import Channel
 from ibrobot_web.messages import (
     Abandoned,
     AskTime,
+    FromServer,
     Jog,
     MalformedMessage,
     Operate,
@@ -27,9 +29,11 @@ from ibrobot_web.messages import (
     Resign,
     RunCommand,
     Sent,
+    StopRun,
     clock_ms,
     from_page,
     stop_from_page,
+    to_run,
 )
 
 _MALFORMED = 20
@@ -264,6 +268,49 @@ class Drive:
             driver.replies.put_nowait(reply)
         except asyncio.QueueFull:  # a page that does not read its replies
             driver.malformed = _MALFORMED
+
+
+class RunLine:
+    """The line to the run: sends it commands and emergency stops, and calls back with its replies.
+
+    Args:
+        channel: to the run.
+    """
+
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
+        self._numbers = itertools.count(1)
+        self._answers: dict[int, Answer] = {}
+
+    def execute(self, sent: Sent[RunCommand], answer: Answer) -> None:
+        """Send a command; without a number it has no reply."""
+        self.send(sent if sent.number is None else attrs.evolve(sent, number=self._numbered(answer)))
+
+    def stop(self, answer: Answer) -> None:
+        """Send an emergency stop."""
+        self.send(StopRun(self._numbered(answer)))
+
+    def release(self) -> None:
+        """Release the deadman of the operator."""
+        self.send(Sent(None, None, Release()))
+
+    def receive(self) -> None:
+        """Pass on the replies that have arrived."""
+        for message in self._channel.receive():
+            match message:
+                case {"reply": int() as number, "ok": value} if number in self._answers:
+                    self._answers.pop(number)({"ok": value})
+                case {"reply": int() as number, "error": str() as why} if number in self._answers:
+                    self._answers.pop(number)({"error": why})
+
+    def send(self, message: FromServer) -> None:
+        """Send a message."""
+        self._channel.send(to_run(message))
+
+    def _numbered(self, answer: Answer) -> int:
+        number = next(self._numbers)
+        self._answers[number] = answer
+        return number
 
 
 def _put(replies: asyncio.Queue[Mapping[str, Any]], number: int, reply: Mapping[str, Any]) -> None:

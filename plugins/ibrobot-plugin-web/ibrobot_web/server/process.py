@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
 import json
 import logging
 import socket
@@ -23,17 +22,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import attrs
 from ibrobot_http.server import HttpServer
 
 from ibrobot_core.app import Channel, read_options, run_child
 from ibrobot_web.link import ALIVE_S, FIRST_PICTURE, STATUS
-from ibrobot_web.messages import Alive, FromServer, Pages, Release, RunCommand, Sent, StopRun, to_run
+from ibrobot_web.messages import Alive, Pages
 from ibrobot_web.options import WebOptions
 from ibrobot_web.pictures import as_jpeg
 from ibrobot_web.server.app import make_app
 from ibrobot_web.server.broadcast import Broadcast
-from ibrobot_web.server.drive import Answer, Drive
+from ibrobot_web.server.drive import Drive, RunLine
 from ibrobot_web.server.page_guard import page_guard
 
 _DRAIN_S = 0.5
@@ -52,12 +50,11 @@ class RunLink:
     def __init__(self, channel: Channel, order: Mapping[str, Any]) -> None:
         self._channel = channel
         self._order = order
-        self._numbers = itertools.count(1)
-        self._answers: dict[int, Answer] = {}
+        self._line = RunLine(channel)
         self._scene: asyncio.Future[bytes] | None = None
         self.ended = asyncio.Event()
         self.broadcast = Broadcast(self._pages_changed, frozenset({STATUS}))
-        self.drive = Drive(self._execute, self._stop, lambda: self._send(Sent(None, None, Release())))
+        self.drive = Drive(self._line.execute, self._line.stop, self._line.release)
 
     async def scene(self) -> bytes:
         """The robot's shapes, made once, in a thread that does not delay the end."""
@@ -75,12 +72,7 @@ class RunLink:
 
     def receive(self) -> None:
         """Handle the messages of the run."""
-        for message in self._channel.receive():
-            match message:
-                case {"reply": int() as number, "ok": value} if number in self._answers:
-                    self._answers.pop(number)({"ok": value})
-                case {"reply": int() as number, "error": str() as why} if number in self._answers:
-                    self._answers.pop(number)({"error": why})
+        self._line.receive()
         if self._channel.closed:
             self.ended.set()
 
@@ -100,29 +92,14 @@ class RunLink:
         finally:
             self.ended.set()
 
-    def _execute(self, sent: Sent[RunCommand], answer: Answer) -> None:
-        number = None
-        if sent.number is not None:
-            number = next(self._numbers)
-            self._answers[number] = answer
-        self._send(attrs.evolve(sent, number=number))
-
-    def _stop(self, answer: Answer) -> None:
-        number = next(self._numbers)
-        self._answers[number] = answer
-        self._send(StopRun(number))
-
     def _pages_changed(self) -> None:
-        self._send(Pages(len(self.broadcast.pages), self.broadcast.wanted))
+        self._line.send(Pages(len(self.broadcast.pages), self.broadcast.wanted))
 
     async def live(self) -> None:
         """Report to the run periodically that the server is alive."""
         while True:
-            self._send(Alive())
+            self._line.send(Alive())
             await asyncio.sleep(ALIVE_S)
-
-    def _send(self, message: FromServer) -> None:
-        self._channel.send(to_run(message))
 
 
 async def serve(channel: Channel, stream: Channel, order: Mapping[str, Any]) -> None:

@@ -65,14 +65,14 @@ export class Agents {
       field("speed", "Percent of its speed", "100"), "%", this.button);
     form.addEventListener("submit", (event) => {
       event.preventDefault();
-      page.call(ARM, { agent: agent.value, seconds: Number(this.seconds), speed: Number(this.speed) / 100, by: "page" });
+      page.drive.service(ARM, { agent: agent.value, seconds: Number(this.seconds), speed: Number(this.speed) / 100, by: "page" });
     });
     return [form];
   }
 
   disarm() {
     const { page } = this;
-    return [h("div", { class: "row" }, h("button", { class: "danger", disabled: !page.operating, onclick: () => page.call(DISARM) }, "Take it back"))];
+    return [h("div", { class: "row" }, h("button", { class: "danger", disabled: !page.operating, onclick: () => page.drive.service(DISARM) }, "Take it back"))];
   }
 }
 

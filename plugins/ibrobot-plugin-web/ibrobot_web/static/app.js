@@ -40,19 +40,6 @@ const page = {
     return Object.entries(this.status.robot.groups).find(([, joints]) => String(joints) === String(own))?.[0] ?? device;
   },
   setDevice(device) { this.chosen = device; update(); },
-  // Carries out a command, and shows its error.
-  async command(name, facts = {}, done = "") {
-    try {
-      const answer = await this.drive.command(name, facts);
-      if (done || typeof answer === "string") toast(done || answer);
-      return true;
-    } catch (error) {
-      toast(error.message, "error");
-      return false;
-    }
-  },
-  // As `command`, for a service of the run.
-  call(service, request = null, done = "") { return this.command("call", { service, request }, done); },
 };
 page.deadman = new Deadman(page.drive);
 window.ibrobot = page; // for tests and for the console
@@ -113,8 +100,8 @@ $("stop").addEventListener("keydown", (event) => {
 });
 
 $("operate").addEventListener("click", () => {
-  if (page.operating) page.command("resign");
-  else page.command("operate", { take_over: true });
+  if (page.operating) page.drive.ask("resign");
+  else page.drive.ask("operate", { take_over: true });
 });
 $("theme").addEventListener("click", switchTheme);
 // Which keys do something now.
@@ -176,7 +163,7 @@ function showFaults() {
   const guard = status?.guard?.text ?? "";
   const unconfirmed = page.unconfirmed ?? "";
   refresh($("faults"), { ended, lost, unconfirmed, estop, faults, held, guard, failure, absent, conditions, operating: page.operating }, () => {
-    const reset = () => h("button", { onclick: () => page.command("reset"), disabled: !page.operating }, "Reset");
+    const reset = () => h("button", { onclick: () => page.drive.ask("reset"), disabled: !page.operating }, "Reset");
     return [
       unconfirmed ? h("div", { class: "fault alarm" }, h("strong", {}, "The robot may not have stopped: "), h("span", {},
         `STOP is not confirmed (${unconfirmed}). Press Esc in the terminal of the run, or switch off the robot's power.`)) : null,
@@ -186,7 +173,7 @@ function showFaults() {
         h("strong", {}, "Fault: "), h("span", {}, `${text}. The robot holds. ${remedy}`), reset())),
       estop && !faults.length ? h("div", { class: "fault" }, h("strong", {}, "Emergency stop. "), reset()) : null,
       held ? h("div", { class: "warning" }, h("strong", {}, "Holding: "), h("span", {}, held),
-        h("button", { onclick: () => page.call("/set_mode", page.status.mode), disabled: !page.operating }, "Go on"))
+        h("button", { onclick: () => page.drive.service("/set_mode", page.status.mode), disabled: !page.operating }, "Go on"))
         : null,
       guard ? h("div", { class: "warning" }, h("strong", {}, "The guard holds the arm back: "), h("span", {}, guard)) : null,
       failure ? h("div", { class: "fault" }, h("strong", {}, "The run ended: "), h("span", {}, failure)) : null,

@@ -54,6 +54,6 @@ export class Dock {
 
   async end() {
     const text = "The robot stops as its YAML says. This page then shows nothing new.";
-    if (await confirm("End the run?", text, "End the run", { no: "Keep it running" })) this.page.command("finish");
+    if (await confirm("End the run?", text, "End the run", { no: "Keep it running" })) this.page.drive.ask("finish");
   }
 }

@@ -1,5 +1,7 @@
 // The two connections to the server: states and pictures, newest only; and commands with their replies.
 
+import { toast } from "./dom.js";
+
 const CHANNELS = { 0: "state", 1: "status", 2: "samples", 3: "plan" };
 const FIRST_PICTURE = 16;
 const HEAD = 1;
@@ -147,6 +149,21 @@ export class Drive extends EventTarget {
 
   // As `call`, for what an emergency stop that the page has not seen makes void.
   command(name, facts = {}) { return this.call(name, { stops: this.stops, ...facts }); }
+
+  // As `command`, and shows the answer or the error; resolves with whether it was carried out.
+  async ask(name, facts = {}, done = "") {
+    try {
+      const answer = await this.command(name, facts);
+      if (done || typeof answer === "string") toast(done || answer);
+      return true;
+    } catch (error) {
+      toast(error.message, "error");
+      return false;
+    }
+  }
+
+  // As `ask`, for a service of the run.
+  service(name, request = null, done = "") { return this.ask("call", { service: name, request }, done); }
 
   // Without a reply.
   tell(command, facts = {}) {

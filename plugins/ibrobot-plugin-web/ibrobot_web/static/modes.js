@@ -26,6 +26,6 @@ export class Modes {
     const { page } = this;
     if (mode.policy && !await confirm(`${capital(mode.label)}?`,
       "The robot moves by itself as soon as it is in this mode, until you stop it or change the mode.", "Let it move", { danger: false })) return;
-    page.call("/set_mode", mode.name, mode.label);
+    page.drive.service("/set_mode", mode.name, mode.label);
   }
 }

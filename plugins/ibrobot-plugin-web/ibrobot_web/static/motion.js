@@ -67,14 +67,14 @@ export class Motion {
       const taken = status.commander !== "policy";
       found.push(h("p", { class: "note" }, COMMANDS[status.commander] ?? ""), h("div", { class: "row" },
         h("button", { class: taken ? "" : "primary", disabled: !page.operating || taken,
-          onclick: () => page.call(INTERVENE, true) }, "Take the robot"),
+          onclick: () => page.drive.service(INTERVENE, true) }, "Take the robot"),
         h("button", { class: taken ? "primary" : "", disabled: !page.operating || !taken,
-          onclick: () => page.call(INTERVENE, false) }, "Give it back")));
+          onclick: () => page.drive.service(INTERVENE, false) }, "Give it back")));
     }
     if (services.includes(SMOOTHING) && dispatch) {
       const box = h("input", { type: "checkbox", disabled: !page.operating });
       box.checked = dispatch.smoothing;
-      box.addEventListener("change", () => page.call(SMOOTHING, box.checked));
+      box.addEventListener("change", () => page.drive.service(SMOOTHING, box.checked));
       found.push(h("label", { class: "row" }, box, "blend chunks (smoothing)"));
     }
     return found;
@@ -86,11 +86,11 @@ export class Motion {
     goal.value = this.goal ?? "";
     goal.addEventListener("input", () => { this.goal = goal.value; });
     this.setGoal = (text) => { goal.value = this.goal = text; this.preview(); };
-    const go = () => page.call(GO_TO, { goal: goal.value }, `goal ${goal.value}`);
+    const go = () => page.drive.service(GO_TO, { goal: goal.value }, `goal ${goal.value}`);
     const form = h("form", { class: "row" }, goal,
       h("button", { type: "button", disabled: !page.operating, onclick: () => this.preview() }, "Preview"),
       h("button", { class: "primary", disabled: !page.operating }, "Go"),
-      h("button", { type: "button", disabled: !page.operating, onclick: () => page.call("/planning/cancel") }, "Cancel"));
+      h("button", { type: "button", disabled: !page.operating, onclick: () => page.drive.service("/planning/cancel") }, "Cancel"));
     form.addEventListener("submit", (event) => {
       event.preventDefault();
       go();

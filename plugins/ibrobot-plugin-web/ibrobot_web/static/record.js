@@ -46,7 +46,7 @@ export class Record {
     const { page } = this;
     if (byMode) return [h("span", { class: "note" }, "The mode begins and ends its episodes itself.")];
     const button = (text, key, service, request, kind = "", disabled = false) => h("button", {
-      class: kind, disabled: !page.operating || disabled, "data-key": key, onclick: () => this.once(key, () => page.call(`/record_episode/${service}`, request)),
+      class: kind, disabled: !page.operating || disabled, "data-key": key, onclick: () => this.once(key, () => page.drive.service(`/record_episode/${service}`, request)),
     }, text, h("kbd", { "aria-hidden": "true" }, key.toUpperCase()));
     const again = (text) => redo ? [button(text, "r", "redo", null, "", stopped)] : [];
     if (waiting) return [button("Cancel", "d", "discard", null)];
@@ -56,7 +56,7 @@ export class Record {
         button("Discard", "d", "discard", null, "danger"), ...again("Again")];
     }
     if (complete) {
-      return [...again("Redo the last"), h("button", { class: "primary", disabled: !page.operating, "data-key": "e", onclick: () => page.command("finish") },
+      return [...again("Redo the last"), h("button", { class: "primary", disabled: !page.operating, "data-key": "e", onclick: () => page.drive.ask("finish") },
         "End the session", h("kbd", { "aria-hidden": "true" }, "E"))];
     }
     const prompt = h("input", { type: "text", "aria-label": "Task", placeholder: "task, e.g. pick the cube" });
@@ -66,7 +66,7 @@ export class Record {
       h("kbd", { "aria-hidden": "true" }, "B")));
     form.addEventListener("submit", (event) => {
       event.preventDefault();
-      this.once("b", () => page.call("/record_episode/start", { prompt: prompt.value || null, wait: true }));
+      this.once("b", () => page.drive.service("/record_episode/start", { prompt: prompt.value || null, wait: true }));
       prompt.blur(); // so that keys judge the episode
     });
     return [form, ...again("Redo the last"), this.cues.choice];
