@@ -7,7 +7,7 @@ import math
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import attrs
 
@@ -51,30 +51,32 @@ _BOUNDS: Mapping[str, tuple[Callable[[Any, Any], bool], str]] = {
 }
 
 
-@attrs.frozen
-class OptionWords:
+class OptionWords(TypedDict, total=False):
     """How forms and command lines show an option."""
 
-    label: str | None = ""
+    label: str | None
     """What forms and their errors call it; the key by default. None: it is for terminals, and not in forms."""
-    more: bool = False
+    more: bool
     """Whether forms show it among further options."""
-    names: str = ""
+    names: str
     """What a text or path names: `episodes`, `dataset`, `policy`, `robot`, `calibration`, `viewer`, or the `options` of
     another program."""
-    suggest: str = ""
+    suggest: str
     """A value that forms enter, e.g. `datasets/{episodes}`: a name in braces stands for the last part of the path given
     for the option of this name. Of several choices, the one that forms tick."""
-    typed: str = ""
+    typed: str
     """What a command line calls it, if that is not made of the key: flags and value, e.g. `-o FILE`, or an argument,
     e.g. `EPISODES`. A value `[HZ=40]` may be left out."""
+
+
+_NO_WORDS: OptionWords = {"label": "", "more": False, "names": "", "suggest": "", "typed": ""}
 
 
 def option(
     default: Any = attrs.NOTHING, *, unit: str = "", help: str = "", ge: float | None = None, gt: float | None = None,
     le: float | None = None, lt: float | None = None, choices: Sequence[Any] | Mapping[str, str] | None = None,
     open: bool = False, factory: Any = None, validator: Any = None, secret: bool = False, key: str | None = None,
-    plain: Any = None, **words: Any,
+    plain: Any = None, **words: Unpack[OptionWords],
 ) -> Any:  # fmt: skip
     """An attrs field for an options class.
 
@@ -93,10 +95,15 @@ def option(
         secret: whether to hide the value; recordings and `config show` contain `${NAME}` as in the YAML, else `***`.
         key: the key in the YAML, if it differs from the field's name.
         plain: type of the value in files and requests, if programs may set others as well.
-        words: fields of `OptionWords`.
+        words: keys of `OptionWords`.
+
+    Raises:
+        TypeError: for another keyword.
     """
+    if unknown := words.keys() - _NO_WORDS.keys():
+        raise TypeError(f"option() has no keyword {', '.join(sorted(unknown))}")
     bounds = {"ge": ge, "gt": gt, "le": le, "lt": lt}
-    metadata: dict[str, Any] = {"unit": unit, "help": help, **bounds, **attrs.asdict(OptionWords(**words))}
+    metadata: dict[str, Any] = {"unit": unit, "help": help, **bounds, **_NO_WORDS, **words}
     metadata["choices"] = tuple(choices) if choices is not None else None
     metadata |= {"secret": secret, "plain": plain, "open": open}
     metadata["words"] = dict(choices) if isinstance(choices, Mapping) else {}

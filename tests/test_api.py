@@ -54,3 +54,8 @@ def test_importing_it_imports_nothing_else_of_core(floor) -> None:
 )
 def test_every_class_and_function_is_documented(floor, name: str) -> None:
     assert inspect.getdoc(getattr(floor, name)), f"{name} has no docstring"
+
+
+def test_a_mistyped_keyword_of_an_option_is_an_error() -> None:
+    with pytest.raises(TypeError, match="has no keyword lable"):
+        api.option(lable="Task")  # type: ignore[call-arg]

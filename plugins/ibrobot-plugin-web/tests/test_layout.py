@@ -213,7 +213,7 @@ async def look_at_messages(page: Any, run: Run) -> None:
     await page.get_by_role("button", name="Begin").wait_for()
     for text in ("one", "two", "three", "four", "five", "five"):
         run.refused = text
-        await page.evaluate("void ibrobot.call('/planning/go_to', {goal: 'nowhere'})")
+        await page.evaluate("void ibrobot.drive.service('/planning/go_to', {goal: 'nowhere'})")
         await page.locator(".toast").get_by_text(text).wait_for()
     shown = page.locator(".toast.error p")
     assert await shown.all_inner_texts() == ["three", "four", "five"], "the last ones, and each once"
@@ -239,7 +239,7 @@ async def look_at_keys_pressed_twice(page: Any, run: Run) -> None:
         before = run.asked
         for key in keys:
             await page.keyboard.press(key)
-        await page.evaluate("ibrobot.call('/planning/go_to', {goal: 'nowhere'})")  # answered after the others
+        await page.evaluate("ibrobot.drive.service('/planning/go_to', {goal: 'nowhere'})")  # answered after the others
         assert run.asked - before == sent + 1
     await page.evaluate("delete performance.now")
     run.refused = ""
