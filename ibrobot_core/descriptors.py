@@ -360,6 +360,9 @@ class UnitsDescriptor(Descriptor[Any]):
     """Robot, model and `Contract` -> the `PolicyVectors`, which convert. Raises CalibrationError."""
     uncalibrated: Callable[[RobotConfig], Iterable[Problem]] = _answer(())
     """Yields what is wrong with the calibrations that a run needs at its start."""
+    of_recording: Callable[[str, Any, Mapping[str, Any], Mapping[str, Any]], Any] = _answer(None)
+    """Unit, `Contract`, calibrations of joints, and robot YAML of a recording -> the `PolicyVectors` of its dataset;
+    None if it converts runs only."""
 
 
 @attrs.frozen

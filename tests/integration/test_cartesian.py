@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from command_line import run_here
-from ibrobot_calibration.joint_units import policy_units
+from ibrobot_calibration.joint_units import calibrated_units
 from ibrobot_data.ticks import Ticks, frames
 from ibrobot_kinematics import robot_model
 from ibrobot_kinematics.rotations import log
@@ -93,7 +93,7 @@ def test_poses_that_a_policy_saw_and_gave_are_converted_bit_by_bit(kept: list[An
     assert info["features"]["action"]["names"] == NAMES
     [file] = (tmp_path / "set/data").rglob("*.parquet")
     table = pq.read_table(file).to_pydict()
-    units = policy_units(spec)("radians", spec, {}, config.document)
+    units = calibrated_units("radians", spec, {}, config.document)
     rows = list(Ticks(reader, spec, "skip"))
     assert len(rows) == len(table["action"]) > 40
     arm = robot_model(config.robot, JOINTS)
@@ -121,7 +121,7 @@ def test_relative_actions_move_each_joint_from_where_it_is_measured(kept: list[A
     [path] = (tmp_path / "default/episodes").iterdir()
     reader = installed_plugins().open_episode(path)
     spec = Contract.from_config(config)
-    units = policy_units(spec)("radians", spec, {}, config.document)
+    units = calibrated_units("radians", spec, {}, config.document)
     rows = [(row, units(row)) for row in Ticks(reader, spec, "skip")]
     reader.close()
     for row, made in rows:
@@ -222,7 +222,7 @@ def test_tools_of_two_arms_are_named_by_their_arm() -> None:
     names = ("left_ee.x", "left_ee.y", "left_ee.z", *turns, "left_ee.gripper_pos")
     assert contract.features()["action"].names[:7] == names
     q = np.linspace(-0.2, 0.3, len(contract.action_joints))
-    made = policy_units(contract)("radians", contract, {}, config.document)({"action": q})["action"]
+    made = calibrated_units("radians", contract, {}, config.document)({"action": q})["action"]
     tip = robot_model(config.robot, contract.action_parts[0].joints).forward(q[:6])
     np.testing.assert_allclose(made[:7], [*tip.position, *log(tip.rotation), q[5]], atol=1e-8)
     with pytest.raises(ConfigError, match=r"several tools; name the arm, e\.g\. tool\.left\.position"):

@@ -364,6 +364,17 @@ def test_joints_in_lerobots_units(bags: Path, tmp_path: Path) -> None:
     assert "or --calibration" in without.err
 
 
+def test_joints_in_the_units_of_a_plugin(bags: Path, tmp_path: Path) -> None:
+    result = run(bags, "--out", tmp_path / "named", "--norm-mode", "radians", "--units", "calibrated")
+    assert result.code == 0, result.err
+    assert json.loads((tmp_path / "named/meta/ibrobot.json").read_bytes())["conversion"]["units"] == "calibrated"
+    other = run(bags, "--out", tmp_path / "named", "--append")
+    assert "was made with other settings: units calibrated, now None" in other.err
+    unknown = run(bags, "--out", tmp_path / "none", "--units", "calibrate")
+    assert unknown.code != 0
+    assert "unknown units type 'calibrate', did you mean 'calibrated'?" in unknown.err
+
+
 @pytest.mark.parametrize("storage", list(StoragePlugin))
 @pytest.mark.parametrize("compression", [None, CompressionMode.MESSAGE, CompressionMode.FILE])
 def test_foreign_bags_by_the_contract_alone(

@@ -15,6 +15,7 @@ def ibrobot_units() -> Iterable[UnitsDescriptor]:
         type="calibrated",
         make=Late("ibrobot_calibration.model_units:model_units"),
         uncalibrated=Late("ibrobot_calibration.model_units:uncalibrated"),
+        of_recording=Late("ibrobot_calibration.joint_units:calibrated_units"),
         summary="degrees and ranges of joints, as in LeRobot, by the calibration",
         default=True,
     )

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ibrobot_calibration.calibration import JointCalibration, load_calibration
-from ibrobot_core.api import ACTION, CalibrationError, Contract, Frame, JointState
-from ibrobot_core.app import PolicyVectors, RobotConfig, installed_plugins
+from ibrobot_core.api import ACTION, CalibrationError, Contract, Frame, JointState, NotSupported
+from ibrobot_core.app import PolicyVectors, RobotConfig, UnitsDescriptor, installed_plugins
 
 LEROBOT_MODES = ("range_m100_100", "range_0_100", "degrees")
 """LeRobot's units of joint positions, named as in its `MotorNormMode`."""
@@ -141,10 +141,44 @@ class JointUnits(PolicyVectors):
         return vector.astype(value.dtype)
 
 
-def policy_units(contract: Contract) -> type[JointUnits]:
-    """The class of the conversion for a contract: `JointUnits`, or that of its actions' features."""
+def calibrated_units(
+    norm_mode: str, contract: Contract, calibration: Mapping[str, Mapping[str, Any]], document: Mapping[str, Any]
+) -> JointUnits:
+    """The conversion by a calibration, `JointUnits` or that of the actions' features; its arguments and errors."""
     words = (part.features[0].partition(".")[0] for part in contract.action_parts if part.features)
-    return next((installed_plugins().features[word].vectors for word in words), JointUnits)  # type: ignore[return-value]
+    kind = next((installed_plugins().features[word].vectors for word in words), JointUnits)
+    made: JointUnits = kind(norm_mode, contract, calibration, document)
+    return made
+
+
+def recorded_units(
+    type_: str | None, norm_mode: str, contract: Contract, calibration: Mapping[str, Mapping[str, Any]],
+    document: Mapping[str, Any],
+) -> PolicyVectors:  # fmt: skip
+    """The conversion of a recording's vectors, as that of a run by `models.NAME.units`.
+
+    Args:
+        type_: the type of the units; None for the default.
+        norm_mode: as for `JointUnits`, as are the others.
+        contract: the contract.
+        calibration: joint -> numbers.
+        document: the robot YAML as plain values.
+
+    Raises:
+        PluginError: if the type is not installed, or several are a default.
+        NotSupported: if it converts runs only.
+        CalibrationError: as `JointUnits`.
+    """
+    has_features = any(part.features for part in contract.action_parts)
+    if norm_mode == "radians" and type_ is None and not has_features:
+        return PolicyVectors()
+    registry = installed_plugins()
+    descriptor = registry.find("units", type_ or registry.default("units"))
+    assert isinstance(descriptor, UnitsDescriptor)
+    made: PolicyVectors | None = descriptor.of_recording(norm_mode, contract, calibration, document)
+    if made is None:
+        raise NotSupported(f"units of type {descriptor.type!r} convert the vectors of runs, not of recordings")
+    return made
 
 
 def calibrations(config: RobotConfig) -> dict[str, dict[str, dict[str, Any]]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from ibrobot_calibration.calibration import load_calibration
-from ibrobot_calibration.joint_units import JointUnits, calibrations, policy_units, with_closed_ends
+from ibrobot_calibration.joint_units import JointUnits, calibrated_units, calibrations, with_closed_ends
 from ibrobot_core.api import CalibrationError, Contract, Options
 from ibrobot_core.app import ModelConfig, Problem, RobotConfig
 
@@ -21,7 +21,7 @@ def model_units(config: RobotConfig, model: ModelConfig, contract: Contract) -> 
         "model": with_closed_ends(load_calibration(name).numbers(), config)
     }  # fmt: skip
     joined = {joint: numbers for joints in each.values() for joint, numbers in joints.items()}
-    return policy_units(contract)(model.norm_mode, contract, joined, config.document)
+    return calibrated_units(model.norm_mode, contract, joined, config.document)
 
 
 def uncalibrated(config: RobotConfig) -> Iterator[Problem]:

@@ -10,9 +10,9 @@ import pytest
 from calibration_files import write_calibration
 from fake_runs import PLUGINS
 from ibrobot_calibration import Calibration, JointCalibration
-from ibrobot_calibration.joint_units import radians_to_lerobot
+from ibrobot_calibration.joint_units import radians_to_lerobot, recorded_units
 
-from ibrobot_core.api import Frame
+from ibrobot_core.api import Contract, Frame, IbrobotError
 from ibrobot_core.app import ComponentFailed
 
 if TYPE_CHECKING:
@@ -90,3 +90,19 @@ def test_units_that_a_model_names_are_used(runs: Runs) -> None:
     for _ in range(24):
         runtime.step()
     assert runtime.session.faults == ()
+
+
+def test_recordings_are_converted_by_the_units_that_are_named(runs: Runs) -> None:
+    runs.site.add("other-units", PLUGINS / "other_units.py")
+    contract = Contract(30.0, (), ())
+    values = {"action": np.array([0.0, np.pi])}
+    plain = recorded_units(None, "radians", contract, {}, {})
+    assert plain(values)["action"].tolist() == [0.0, np.pi]
+    other = recorded_units("other_units", "degrees", contract, {}, {})
+    assert other(values)["action"].tolist() == [0.0, 180.0]
+    with pytest.raises(IbrobotError, match=r"name the type of the units: several .* a default"):
+        recorded_units(None, "degrees", contract, {}, {})
+    with pytest.raises(IbrobotError, match="'units_of_runs' convert the vectors of runs, not of recordings"):
+        recorded_units("units_of_runs", "degrees", contract, {}, {})
+    with pytest.raises(IbrobotError, match=r"unknown units type 'other_unit'.*did you mean 'other_units'"):
+        recorded_units("other_unit", "degrees", contract, {}, {})

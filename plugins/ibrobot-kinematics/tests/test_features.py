@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ibrobot_calibration.joint_units import policy_units
+from ibrobot_calibration.joint_units import calibrated_units
 from ibrobot_kinematics import Target, read_mjcf
 from ibrobot_kinematics.feature_vectors import FeatureVectors
 from ibrobot_kinematics.follow import follow
@@ -96,7 +96,7 @@ class Arm:
         return installed_plugins().features[name].model(self.robot, own)
 
     def units(self, contract: Contract, norm_mode: str = "radians", calibration: Any = None) -> FeatureVectors:
-        made = policy_units(contract)(norm_mode, contract, calibration or {}, self.document)
+        made = calibrated_units(norm_mode, contract, calibration or {}, self.document)
         assert isinstance(made, FeatureVectors)
         return made
 
@@ -246,7 +246,7 @@ class TestDeltas:
         deltas = arm.contract([f"delta.{name}" for name in arm.joints])
         assert deltas.features()["action"].names == (*(f"{name}.delta" for name in arm.joints), "gripper.pos")
         relative = arm.units(deltas, norm_mode, calibration)
-        absolute = policy_units(arm.contract([]))(norm_mode, arm.contract([]), calibration, arm.document)
+        absolute = calibrated_units(norm_mode, arm.contract([]), calibration, arm.document)
         path = a_path(arm).astype(np.float32)
         for state, action in itertools.pairwise(path):
             row = {STATE: state, "action": action}

@@ -150,12 +150,15 @@ def conversion_request(options: Convert) -> ConversionRequest:
         IbrobotError: for options that do not fit, or what they need is not installed.
     """
     check_pool(options.on)
+    if options.units is not None:
+        installed_plugins().find("units", options.units)
     type_ = options.type_ or installed_plugins().default("dataset")
     writer_options = _options("dataset", type_, options.writer_overrides())
     robot, calibration = _stated(options)
     return ConversionRequest(
         options.out, writer_options, type_, append=options.append, outcomes=options.outcome,
-        jobs=options.jobs, on=options.on, norm_mode=options.norm_mode or NORM_MODES[0], missing=options.missing,
+        jobs=options.jobs, on=options.on, norm_mode=options.norm_mode or NORM_MODES[0],
+        units=options.units, missing=options.missing,
         prompt=options.prompt, success=options.success, only=options.only, context=options.context,
         any_robot=options.any_robot,
         force_contract=options.force_contract, calibration=calibration,

@@ -64,6 +64,9 @@ class ConvertOptions:
         more=True,
         help="unit of the dataset's joints; by default radians, or that of the dataset with --to bag",
     )
+    units: str | None = option(
+        None, label=None, help="type of what converts to this unit; needed if several plugins offer a default"
+    )
     success: bool = option(
         False, label="Add next.success", more=True, help="add a feature that is true in the last row of a success"
     )

@@ -17,7 +17,7 @@ from uuid import uuid4
 import attrs
 import numpy as np
 from ibrobot_calibration import Calibration, JointCalibration
-from ibrobot_calibration.joint_units import policy_units
+from ibrobot_calibration.joint_units import recorded_units
 from ibrobot_provenance.datasets import DatasetWriter
 from ibrobot_provenance.files import sync
 from ibrobot_provenance.ownership import Ownership
@@ -125,7 +125,7 @@ def unit_key(job: Job) -> str:
     shaping = [
         _VERSION, request.type, attrs.asdict(request.options), contract, request.force_contract,
         request.document, request.calibration, request.norm_mode, request.missing, request.prompt, request.success,
-        request.labels, request.only, request.context,
+        request.labels, request.only, request.context, request.units,
     ]  # fmt: skip
     address = EpisodeAddress.of(job.episode)
     root = address.path
@@ -309,7 +309,7 @@ def _write(
     document = request.document or _recorded(begun, "config")
     recorded = _joined(_recorded(begun, "calibration"))
     calibration = recorded if request.calibration is None else _completed(request.calibration, recorded)
-    units = policy_units(contract)(request.norm_mode, contract, calibration, document)
+    units = recorded_units(request.units, request.norm_mode, contract, calibration, document)
     robot_type = (document.get("robot") or {}).get("robot_type") or begun.metadata.get("robot_type", "")
     prompt = _prompt(begun, request)
     ticks = Ticks(reader, contract, request.missing)

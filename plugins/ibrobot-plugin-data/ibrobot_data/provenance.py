@@ -27,7 +27,8 @@ def conversion(request: ConversionRequest) -> dict[str, Any]:
         "success": request.success,
         "missing": request.missing,
     }
-    return settings | ({"labels": True} if request.labels else {})
+    given = {"labels": request.labels, "units": request.units}
+    return settings | {name: value for name, value in given.items() if value}
 
 
 def provenance(

@@ -41,7 +41,7 @@ CUES = ("beep", "speech", "none")
 """Kinds of cues; see `Cues`."""
 
 
-_OF_CONVERSION = ("outcome", "only", "context", "missing", "norm_mode", "success", "any_robot")
+_OF_CONVERSION = ("outcome", "only", "context", "missing", "norm_mode", "units", "success", "any_robot")
 """Options of `ibrobot convert` that this command has, too, as `--convert-OPTION`."""
 
 

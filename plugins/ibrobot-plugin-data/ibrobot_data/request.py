@@ -33,6 +33,8 @@ class ConversionRequest:
     calibration: Mapping[str, Mapping[str, Any]] | None = None
     """Joint -> fields of `JointCalibration`; replaces the recorded ones."""
     norm_mode: str = option("radians", choices=NORM_MODES)
+    units: str | None = None
+    """Type of what converts to `norm_mode`; None for the default."""
     missing: str = option("skip", choices=MISSING)
     """How to treat a tick with a missing observation: refuse the episode, skip the tick, or hold the last value."""
     outcomes: tuple[str, ...] = tuple(OUTCOMES)

@@ -282,7 +282,8 @@ def _check_old(request: ConversionRequest, old: DatasetSummary) -> None:
         raise DatasetError(f"{request.out}: not made by a conversion of ibrobot; convert into another folder")
     asked = conversion(request)
     known = {"missing": asked["missing"]} | known  # older datasets do not have it
-    wrong = [f"{name} {known.get(name)}, now {asked[name]}" for name in asked if known.get(name) != asked[name]]
+    names = [name for name in asked | known if known.get(name) != asked.get(name)]
+    wrong = [f"{name} {known.get(name)}, now {asked.get(name)}" for name in names]
     if wrong:
         raise DatasetError(f"{request.out}: was made with other settings: {'; '.join(wrong)}")
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import attrs
 import numpy as np
-from ibrobot_calibration.joint_units import policy_units
+from ibrobot_calibration.joint_units import recorded_units
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
@@ -95,7 +95,7 @@ class Model:
         calibration = json.loads(window.metadata.get("calibration", "{}"))
         joined = {joint: numbers for each in calibration.values() for joint, numbers in each.items()}
         mode = model.norm_mode or self.policy.spec.norm_mode or "radians"
-        self._units = policy_units(self.contract)(mode, self.contract, joined, window.document)
+        self._units = recorded_units(model.units, mode, self.contract, joined, window.document)
         if window.mode.get("dispatch", {}).get("strategy") == "rtc":
             raise RecorderError(
                 f"{episode}: its policy continued the plan that it was given (strategy rtc), which is not recorded, so "
