@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from command_line import run_here
+from evaluations import episodes_here, ready_forkserver
+from ibrobot_testing.site import made_up_site
 
 from ibrobot_core.config import find_config
 from ibrobot_core.plugins import installed_plugins
@@ -28,47 +30,105 @@ pytestmark = pytest.mark.integration
 PATIENCE_S = 120.0
 
 
-def write_picks(folder: Path) -> Path:
-    """Write the robot YAML `picks`, whose modes are one good policy twice, and one that cannot grasp."""
+REACH = """\
+robot:
+  name: mini
+  joints:
+    - {name: pan, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}
+    - {name: grip, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}
+  groups: {all: [pan, grip]}
+simulation: {type: reach}
+executors:
+  all_position: {type: position, group: all}
+models:
+  good: {type: bad, how: good}
+  poor: {type: bad, how: poor}
+control_modes:
+  scripted: {executors: [all_position], inference: {model: good}, dispatch: {watermark: 5}}
+  again: {executors: [all_position], inference: {model: good}, dispatch: {watermark: 5}}
+  faulty: {executors: [all_position], inference: {model: poor}, dispatch: {watermark: 5}}
+default_control_mode: scripted
+contract:
+  rate_hz: 25
+  max_duration_s: 20  # so that an episode lasts long enough to be interrupted
+  observations:
+    - {key: observation.state, topic: /joint_states, select: [position.pan, position.grip]}
+  actions:
+    - {executor: all_position, topic: /all/commands}
+control: {rate_hz: 100, stop: hold}
+"""
+"""A robot whose episodes are computed quickly, with the same modes."""
+
+
+def write_robots(folder: Path) -> Path:
+    """Write the robot YAMLs `picks` and `reach`, whose modes are one good policy twice, and one that cannot succeed."""
     text = find_config("so101_pick_cube", installed_plugins()).read_text(encoding="utf-8")
     text = text.replace("max_duration_s: 20", "max_duration_s: 6")
+    text = text.replace("  rate_hz: 100\n", "  rate_hz: 50\n")  # half of the ticks
     text = text.replace("\nmodels:\n", "\nmodels:\n  broken: {type: scripted_pick, gripper_closed: 0.6}\n")
     executors = "executors: [arm_position, gripper_position]"
-    modes = "".join(
-        f"  {name}: {{{executors}, inference: {{model: {model}}}}}\n"
-        for name, model in (("again", "scripted_pick"), ("faulty", "broken"))
+    text = text.replace(
+        "\ncontrol_modes:\n",
+        f"\ncontrol_modes:\n  faulty: {{{executors}, inference: {{model: broken}}}}\n",
     )
-    text = text.replace("\ncontrol_modes:\n", f"\ncontrol_modes:\n{modes}")
     (folder / "picks.yaml").write_text(text, encoding="utf-8")
+    (folder / "reach.yaml").write_text(REACH, encoding="utf-8")
     return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Installs the policies and the scene of `reach`."""
+    plugins = Path(__file__).parents[1] / "shared/plugins"
+    with (
+        pytest.MonkeyPatch.context() as monkeypatch,
+        made_up_site(tmp_path_factory.mktemp("installed") / "site", plugins, monkeypatch) as site,
+    ):
+        site.add("bad-policies", "bad_policies.py")
+        with ready_forkserver():
+            yield
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A new folder with the robot YAML `picks` for each test, so that a rerun starts from scratch."""
+    """A new folder with the robot YAMLs for each test, so that a rerun starts from scratch."""
     (tmp_path / "eval").mkdir()
-    return write_picks(tmp_path / "eval")
+    return write_robots(tmp_path / "eval")
+
+
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    with episodes_here(monkeypatch):
+        yield
+
+
+def evaluated(folder: Path, robot: str) -> Path:
+    """An evaluation of two policies with two episodes each, in one process."""
+    done = evaluate(write_robots(folder), "--out", "whole", "--jobs", 1, robot=robot)
+    assert done.returncode == 0, done.stderr
+    assert "scripted  2 of 2 succeeded" in done.stdout
+    assert "faulty    0 of 2 succeeded" in done.stdout
+    return folder / "whole"
+
+
+@pytest.fixture(scope="module")
+def picked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return evaluated(tmp_path_factory.mktemp("picked"), "picks.yaml")
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An evaluation of two policies with three episodes each, in one process."""
-    folder = write_picks(tmp_path_factory.mktemp("whole"))
-    done = evaluate(folder, "--out", "whole", "--jobs", 1)
-    assert done.returncode == 0, done.stderr
-    assert "scripted  3 of 3 succeeded" in done.stdout
-    assert "faulty    0 of 3 succeeded" in done.stdout
-    return folder / "whole"
+    return evaluated(tmp_path_factory.mktemp("whole"), "reach.yaml")
 
 
-def arguments(*more: object) -> list[str]:
+def arguments(*more: object, robot: str = "reach.yaml") -> list[str]:
     policies = ("--mode", "scripted", "--mode", "faulty")
-    return ["eval", "picks.yaml", *policies, "--episodes", "3", "--videos", "1", *map(str, more)]
+    return ["eval", robot, *policies, "--episodes", "2", "--videos", "1", *map(str, more)]
 
 
-def evaluate(folder: Path, *more: object) -> subprocess.CompletedProcess[str]:
+def evaluate(folder: Path, *more: object, robot: str = "reach.yaml") -> subprocess.CompletedProcess[str]:
     with chdir(folder):
-        return run_here(*arguments(*more))
+        return run_here(*arguments(*more, robot=robot))
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -123,23 +183,25 @@ def start(folder: Path) -> Iterator[Any]:
         each.process.communicate()
 
 
-def test_two_processes_give_the_bytes_of_one(folder: Path, whole: Path) -> None:
-    assert evaluate(folder, "--out", "two", "--jobs", 2).returncode == 0
-    assert digests(folder / "two") == digests(whole)
-    assert len(list(whole.rglob("*.mcap"))) == 6
+def test_two_processes_give_the_bytes_of_one(folder: Path, picked: Path) -> None:
+    assert evaluate(folder, "--out", "two", "--jobs", 2, robot="picks.yaml").returncode == 0
+    assert digests(folder / "two") == digests(picked)
+    assert len(list(picked.rglob("*.mcap"))) == 4
+    assert len(list(picked.rglob("*.mp4"))) == 1
 
 
-def test_printed_command_repeats_an_episode_byte_by_byte(folder: Path, whole: Path, tmp_path: Path) -> None:
-    episode = json.loads((whole / "report.json").read_text())["episodes"][-1]
-    assert (episode["policy"], episode["seed"], episode["success"]) == ("faulty", 2, False)
+def test_printed_command_repeats_an_episode_byte_by_byte(folder: Path, picked: Path, tmp_path: Path) -> None:
+    episode = json.loads((picked / "report.json").read_text())["episodes"][-1]
+    assert (episode["policy"], episode["seed"], episode["success"]) == ("faulty", 1, False)
     program, *command = shlex.split(episode["command"])
     (tmp_path / "picks.yaml").write_bytes((folder / "picks.yaml").read_bytes())
     with chdir(tmp_path):
         assert (program, run_here(*command).returncode) == ("ibrobot", 3)
     repeated = tmp_path / "episodes/default/episodes/episode_000001"
-    assert digests(repeated) == digests(whole / episode["recording"])
+    assert digests(repeated) == digests(picked / episode["recording"])
 
 
+@pytest.mark.usefixtures("here")
 def test_pictures_that_the_policy_does_not_look_at_are_recorded_on_request_only(tmp_path: Path) -> None:
     shared = "so101.yaml", "--sim", "--episodes", 1, "--jobs", 1, "--videos", 0, "--set", "contract.max_duration_s=1"
     lines = []
@@ -161,11 +223,11 @@ def topics_of(episode: Path) -> dict[str, int]:
 
 def test_episode_of_a_killed_worker_is_run_again(start: Any, folder: Path, whole: Path) -> None:
     running = start("--out", "killed", "--jobs", 1)
-    assert "(1 of 6)" in running.await_episode()
+    assert "(1 of 4)" in running.await_episode()
     (worker,) = running.workers()
     os.kill(worker, signal.SIGKILL)
     code, _, err = running.end()
-    assert (code, [f"({n} of 6)" in err for n in range(2, 7)]) == (0, [True] * 5), err
+    assert (code, [f"({n} of 4)" in err for n in range(2, 5)]) == (0, [True] * 3), err
     assert digests(folder / "killed") == digests(whole)
 
 
@@ -177,9 +239,9 @@ def test_interrupted_evaluation_goes_on_with_nothing_twice(start: Any, folder: P
     assert (code, "Traceback" in err) == (130, False), err
     assert "run the same command again to continue" in err
     results = {path: path.stat().st_mtime_ns for path in (folder / "stopped" / "results").rglob("*.json")}
-    assert 1 <= len(results) < 6
+    assert 1 <= len(results) < 4
     done = evaluate(folder, "--out", "stopped", "--jobs", 2)
-    assert (done.returncode, done.stderr.count("success (") + done.stderr.count("failure (")) == (0, 6 - len(results))
+    assert (done.returncode, done.stderr.count("success (") + done.stderr.count("failure (")) == (0, 4 - len(results))
     assert {path: path.stat().st_mtime_ns for path in results} == results
     assert digests(folder / "stopped") == digests(whole)
 
@@ -200,6 +262,7 @@ def test_workers_end_with_a_killed_command_and_write_nothing_more(start: Any, fo
     assert sorted((folder / "orphaned/results").rglob("*.json")) == results
 
 
+@pytest.mark.usefixtures("here")
 def test_merged_shards_are_the_whole_evaluation(folder: Path, whole: Path) -> None:
     for number, videos in ((2, 0), (1, 1)):
         done = evaluate(folder, "--out", f"part{number}", "--shard", f"{number}/2", "--videos", videos, "--jobs", 1)
@@ -217,7 +280,7 @@ def test_merged_shards_are_the_whole_evaluation(folder: Path, whole: Path) -> No
     assert "part1: has scripted, seed 0, which part1 has too" in twice.stderr
     assert "is not an evaluation: it has no evaluation.json" in other.stderr
     assert "other: differs from part1: policies faulty contract changed" in contract.stderr
-    assert (merged.returncode, "scripted  3 of 3 succeeded" in merged.stdout) == (0, True), merged.stderr
+    assert (merged.returncode, "scripted  2 of 2 succeeded" in merged.stdout) == (0, True), merged.stderr
     assert digests(folder / "merged") == digests(whole)
     refused = evaluate(folder, "--out", "part3", "--shard", "2/1")
     assert "--shard: '2/1' is no part; give I/N with I from 1 to N, e.g. 2/8" in refused.stderr
@@ -225,22 +288,23 @@ def test_merged_shards_are_the_whole_evaluation(folder: Path, whole: Path) -> No
 
 @pytest.mark.parametrize("numbers", [(2,), pytest.param((1, 2), marks=pytest.mark.long)], ids=str)
 def test_it_stops_as_soon_as_the_fault_is_certain(folder: Path, numbers: tuple[int, ...]) -> None:
+    options = ("--until-decided", "--episodes", 30, "--set", "contract.max_duration_s=1")
     reports = []
     for jobs in numbers:
-        options = ("--until-decided", "--episodes", 30, "--jobs", jobs, "--out", f"decided{jobs}")
-        done = evaluate(folder, *options)
+        done = evaluate(folder, *options, "--jobs", jobs, "--out", f"decided{jobs}")
         assert done.returncode == 0, done.stderr
         assert "scripted  8 of 8 succeeded" in done.stdout
         assert "scripted is better than faulty" in done.stdout
         reports.append(digests(folder / f"decided{jobs}"))
     assert reports[0] == reports[-1]
-    done = evaluate(folder, "--until-decided", "--episodes", 30, "--out", "decided2")
+    done = evaluate(folder, *options, "--out", "decided2")
     assert (done.returncode, digests(folder / "decided2")) == (0, reports[0]), "the same command adds nothing"
 
 
+@pytest.mark.usefixtures("here")
 def test_policy_beside_itself_is_no_different(folder: Path) -> None:
     with chdir(folder):
-        command = ("eval", "picks.yaml", "--mode", "scripted", "--mode", "again", "--episodes", 3, "--out", "self")
+        command = ("eval", "reach.yaml", "--mode", "scripted", "--mode", "again", "--episodes", 3, "--out", "self")
         done = run_here(*command, "--json")
     (comparison,) = json.loads(done.stdout)["comparisons"]
     assert comparison["pairs"] == {"first": 0, "second": 0, "same": 3}
@@ -248,15 +312,18 @@ def test_policy_beside_itself_is_no_different(folder: Path) -> None:
     assert comparison["more_episodes"] > 10
 
 
-def test_policies_of_several_yamls_are_compared(folder: Path, whole: Path) -> None:
+@pytest.mark.usefixtures("here")
+def test_policies_of_several_yamls_are_compared(folder: Path) -> None:
     with chdir(folder):
-        text = Path("picks.yaml").read_text()
-        Path("wide.yaml").write_text(text.replace("gripper_closed: 0.6", "gripper_closed: 0.7"))
-        command = ("eval", "picks.yaml", "wide.yaml", "--mode", "faulty", "--episodes", 1, "--out", "yamls", "--json")
+        text = Path("reach.yaml").read_text().replace("max_duration_s: 20", "max_duration_s: 1")
+        Path("short.yaml").write_text(text)
+        Path("seldom.yaml").write_text(text.replace("how: poor}", "how: poor, every: 2}"))
+        command = ("eval", "short.yaml", "seldom.yaml", "--mode", "faulty", "--episodes", 2, "--out", "yamls", "--json")
         done = run_here(*command)
     assert done.returncode == 0, done.stderr
     (comparison,) = json.loads(done.stdout)["comparisons"]
-    assert (comparison["first"], comparison["second"]) == ("picks", "wide")
+    assert (comparison["first"], comparison["second"]) == ("short", "seldom")
+    assert comparison["pairs"] == {"first": 0, "second": 1, "same": 1}
 
 
 def test_folder_of_other_settings_is_refused(folder: Path, whole: Path, tmp_path: Path) -> None:
@@ -266,7 +333,7 @@ def test_folder_of_other_settings_is_refused(folder: Path, whole: Path, tmp_path
         (("--margin", 0.2), "margin 0.1, now 0.2"),
         (("--set", "control.rate_hz=50"), "policies scripted robot YAML changed"),
         (("--mode", "again"), "policies again is new"),
-        (("--episodes", 2), "--episodes must not be smaller"),
+        (("--episodes", 1), "--episodes must not be smaller"),
     ):
         done = evaluate(folder, "--out", whole, *more)
         assert (done.returncode, said in done.stderr) == (2, True), done.stderr
@@ -279,7 +346,10 @@ def test_folder_of_other_settings_is_refused(folder: Path, whole: Path, tmp_path
 def test_folder_has_one_owner(start: Any, folder: Path) -> None:
     running = start("--out", "owned", "--jobs", 1)
     running.await_episode()
+    (worker,) = running.workers()
+    os.kill(worker, signal.SIGSTOP)  # so that it does not end before the other begins
     done = evaluate(folder, "--out", "owned")
+    os.kill(worker, signal.SIGKILL)
     assert done.returncode == 1
     assert f"owned: is being evaluated by process {running.process.pid}" in done.stderr
 
@@ -311,11 +381,12 @@ def test_scene_without_a_task_is_an_error(folder: Path) -> None:
 def test_events_tell_a_program_the_result(folder: Path, whole: Path) -> None:
     done = evaluate(folder, "--out", whole, "--events")
     begin, report = (json.loads(line) for line in done.stdout.splitlines())
-    assert (done.returncode, begin) == (0, {"event": "begin", "of": 6, "done": 6})
+    assert (done.returncode, begin) == (0, {"event": "begin", "of": 4, "done": 4})
     assert (report["event"], report["out"]) == ("report", str(whole))
-    assert report["lines"][1].startswith("faulty    0 of 3 succeeded")
+    assert report["lines"][1].startswith("faulty    0 of 2 succeeded")
 
 
+@pytest.mark.usefixtures("here")
 def test_episode_with_a_varied_key_is_repeated_by_its_command(folder: Path, tmp_path: Path) -> None:
     with chdir(folder):
         options = (

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import csv
 import json
-import logging
 import random
-import sys
 from collections.abc import Callable, Generator, Iterable, Iterator
-from multiprocessing import forkserver, set_forkserver_preload
 from pathlib import Path
 from typing import Any, override
 
 import pytest
 from command_line import run_here
-from ibrobot_provenance.jobs import Done, Job, Pool
+from evaluations import Here, episodes_here, ready_forkserver
+from ibrobot_provenance.jobs import Done, Job
 from ibrobot_testing.site import Site, made_up_site
-
-from ibrobot_core.app import installed_plugins
 
 pytestmark = pytest.mark.integration
 
@@ -49,40 +45,14 @@ control: {rate_hz: 50, stop: hold}
 
 @pytest.fixture(scope="module", autouse=True)
 def _forkserver() -> Iterator[None]:
-    """The process that starts those of the pool outlives a test, and has imported what they need.
-
-    One that earlier tests have started has imported what they had, or nothing: its processes take seconds to begin, and
-    longer on a busy machine.
-    """
-    server: Any = forkserver._forkserver  # nothing public ends one
-    server._stop()
-    installed_plugins()
-    needed = ("ibrobot_core.cli.main", "ibrobot_eval.evaluation", "ibrobot_testing.fakes")
-    # Of other plugins the packages alone: what reads the installed plugins when it is imported would not see the site.
-    plugins = (name for name in sys.modules if name.startswith("ibrobot_") and "." not in name)
-    set_forkserver_preload([*needed, *plugins])
-    forkserver.ensure_running()
-    yield
-    server._stop()
-
-
-class Here(Pool):
-    """Runs jobs in this process, which is quick."""
-
-    @override
-    def run[R](self, jobs: Iterable[Job[R]], watch: Callable[[int], None] = lambda count: None) -> Generator[Done[R]]:
-        for job in jobs:
-            yield Done(job, *job.run(lambda count: None))
+    with ready_forkserver():
+        yield
 
 
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr("ibrobot_eval.evaluation.open_pool", lambda *_: Here())
-    log, requests = logging.getLogger("ibrobot"), logging.getLogger("ibrobot.inference")
-    level, filters = log.level, [*requests.filters]
-    yield
-    log.setLevel(level)  # an episode makes both quiet, for its process
-    requests.filters[:] = filters
+    with episodes_here(monkeypatch):
+        yield
 
 
 @pytest.fixture

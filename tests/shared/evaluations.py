@@ -1,0 +1,54 @@
+"""Evaluations in tests: a pool without processes, and the process from which pools start theirs."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager
+from multiprocessing import forkserver, set_forkserver_preload
+from typing import Any, override
+
+import pytest
+from ibrobot_provenance.jobs import Done, Job, Pool
+
+from ibrobot_core.app import installed_plugins
+
+
+@contextmanager
+def ready_forkserver() -> Iterator[None]:
+    """The process that starts those of the pool outlives a test, and has imported what they need.
+
+    One that earlier tests have started has imported what they had, or nothing: its processes take seconds to begin, and
+    longer on a busy machine.
+    """
+    server: Any = forkserver._forkserver  # nothing public ends one
+    server._stop()
+    installed_plugins()
+    needed = ("ibrobot_core.cli.main", "ibrobot_eval.evaluation", "ibrobot_testing.fakes")
+    # Of other plugins the packages alone: what reads the installed plugins when it is imported would not see the site.
+    plugins = (name for name in sys.modules if name.startswith("ibrobot_") and "." not in name)
+    set_forkserver_preload([*needed, *plugins])
+    forkserver.ensure_running()
+    yield
+    server._stop()
+
+
+class Here(Pool):
+    """Runs jobs in this process, which is quick."""
+
+    @override
+    def run[R](self, jobs: Iterable[Job[R]], watch: Callable[[int], None] = lambda count: None) -> Generator[Done[R]]:
+        for job in jobs:
+            yield Done(job, *job.run(lambda count: None))
+
+
+@contextmanager
+def episodes_here(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Evaluations run their episodes in this process."""
+    monkeypatch.setattr("ibrobot_eval.evaluation.open_pool", lambda *_: Here())
+    log, requests = logging.getLogger("ibrobot"), logging.getLogger("ibrobot.inference")
+    level, filters = log.level, [*requests.filters]
+    yield
+    log.setLevel(level)  # an episode makes both quiet, for its process
+    requests.filters[:] = filters
