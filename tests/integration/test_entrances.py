@@ -12,6 +12,7 @@ import re
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import deadman_table
 import entrances
@@ -317,6 +318,18 @@ def check_death(entrance: Entrance, cell: str) -> None:
     assert run.moved(len(run.commands) - 10) < _STILL_RAD
 
 
+def alike() -> Iterator[Any]:
+    """The cells that say something; those of an entrance that another name has, too, e.g. its device's, are `long`."""
+    measured: set[object] = set()
+    for name, column, cell in CELLS:
+        if cell != "-":
+            key = (ADAPTERS.get(name, name), TOOLS.get(name), column, cell)
+            is_again = key in measured and (name, column) not in ELSEWHERE
+            measured.add(key)
+            marks = [pytest.mark.long] if is_again else []
+            yield pytest.param(name, column, cell, id=f"{name}-{column}", marks=marks)
+
+
 def check_elsewhere(test: str) -> None:
     """There is a test of this name."""
     file, _, name = test.partition("::")
@@ -334,10 +347,7 @@ CHECKS: Mapping[str, Callable[[Entrance, str], None]] = dict(
 
 
 @pytest.mark.usefixtures("parts")
-@pytest.mark.parametrize(
-    ("name", "column", "cell"),
-    [pytest.param(*cell, id=f"{cell[0]}-{cell[1]}") for cell in CELLS if cell[2] != "-"],
-)
+@pytest.mark.parametrize(("name", "column", "cell"), [*alike()])
 def test_cell(name: str, column: str, cell: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # for the files of devices
     if (elsewhere := ELSEWHERE.get((name, column))) is not None:

@@ -162,30 +162,38 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
-@pytest.mark.parametrize("size", [(1440, 900), (390, 844)], ids=["desktop", "phone"])
-def test_the_page_plots_what_the_sensor_measures(tmp_path: Path, device: EmulatedNetFt, size: tuple[int, int]) -> None:
+def test_the_page_plots_what_the_sensor_measures(tmp_path: Path, device: EmulatedNetFt) -> None:
     """Forces and torques, which have other units, do not share an axis."""
     from playwright.sync_api import sync_playwright
 
     pictures = os.environ.get("IBROBOT_PICTURES")  # to look at them
     with page_run(str(robot(tmp_path, device)), "--sim", folder=tmp_path) as address, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": size[0], "height": size[1]})
-        page.goto(address)
-        page.get_by_role("button", name="Plots", exact=True).click()
-        page.wait_for_selector("#plot-topic option", state="attached", timeout=60_000)
-        waited = 0
-        while "/force/wrist/wrench" not in (topics := page.locator("#plot-topic option").all_inner_texts()):
-            page.wait_for_timeout(100)
-            assert (waited := waited + 1) < 600, topics
-        page.get_by_label("Topic", exact=True).select_option("/force/wrist/wrench")
-        kinds = page.get_by_label("Values", exact=True)
-        assert kinds.locator("option").all_inner_texts() == ["wrench.force", "wrench.torque"]
-        assert [text for text in page.locator("#panel-plots .legend span").all_inner_texts() if text] == ["x", "y", "z"]
-        kinds.select_option("wrench.torque")
-        assert [text for text in page.locator("#panel-plots .legend span").all_inner_texts() if text] == ["x", "y", "z"]
-        kinds.select_option("wrench.force")
-        page.wait_for_timeout(3000 if pictures else 0)
-        if pictures:
-            page.screenshot(path=f"{pictures}/force-{size[0]}.png")
+        for width, height in ((1440, 900), (390, 844)):
+            context = browser.new_context(
+                viewport={"width": width, "height": height}, device_scale_factor=1 if pictures else 0.25
+            )
+            page = context.new_page()
+            page.goto(address)
+            plots_forces_and_torques(page)
+            page.wait_for_timeout(3000 if pictures else 0)
+            if pictures:
+                page.screenshot(path=f"{pictures}/force-{width}.png")
+            context.close()
         browser.close()
+
+
+def plots_forces_and_torques(page: Any) -> None:
+    page.get_by_role("button", name="Plots", exact=True).click()
+    page.wait_for_selector("#plot-topic option", state="attached", timeout=60_000)
+    waited = 0
+    while "/force/wrist/wrench" not in (topics := page.locator("#plot-topic option").all_inner_texts()):
+        page.wait_for_timeout(100)
+        assert (waited := waited + 1) < 600, topics
+    page.get_by_label("Topic", exact=True).select_option("/force/wrist/wrench")
+    kinds = page.get_by_label("Values", exact=True)
+    assert kinds.locator("option").all_inner_texts() == ["wrench.force", "wrench.torque"]
+    assert [text for text in page.locator("#panel-plots .legend span").all_inner_texts() if text] == ["x", "y", "z"]
+    kinds.select_option("wrench.torque")
+    assert [text for text in page.locator("#panel-plots .legend span").all_inner_texts() if text] == ["x", "y", "z"]
+    kinds.select_option("wrench.force")

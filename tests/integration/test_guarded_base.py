@@ -123,7 +123,7 @@ def test_without_the_guard_it_drives_into_it(monkeypatch) -> None:
     drive.close()
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(2, 6))])
 def test_no_twist_leads_into_anything(monkeypatch, seed: int) -> None:
     """Twists of all three axes among boxes; wheels that reach 60 to 100 % of what they are sent."""
     rng = np.random.default_rng(seed)

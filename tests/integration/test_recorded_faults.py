@@ -167,7 +167,7 @@ def test_replies_that_fail_for_a_time_are_gaps(begin: Callable[[int], Bench]) ->
     assert f"{STATES}: nothing new for " in verified
 
 
-@pytest.mark.parametrize("fault", ["disconnected", "unplugged"])
+@pytest.mark.parametrize("fault", ["disconnected", pytest.param("unplugged", marks=pytest.mark.long)])
 def test_an_arm_that_is_gone_is_missing_to_the_end(begin: Callable[[int], Bench], fault: str) -> None:
     bench = begin(200)
     bench.go_on(STATES)
@@ -194,7 +194,7 @@ def test_a_servo_that_lost_its_power_for_a_moment_is_measured_again(begin: Calla
     compared(bench)
 
 
-@pytest.mark.parametrize("fault", ["error", "overloaded"])
+@pytest.mark.parametrize("fault", ["error", pytest.param("overloaded", marks=pytest.mark.long)])
 def test_a_servo_that_reports_an_error_gives_no_old_state(begin: Callable[[int], Bench], fault: str) -> None:
     bench = begin(200)
     bench.go_on(STATES)

@@ -50,7 +50,7 @@ KINDS = {
 }
 """Each sees pictures."""
 _DURATION_S = {"blind": 2}
-"""Of its run, if it takes more than 15 answers to judge it [s]."""
+"""Of its run, if it takes more than six answers to judge it [s]."""
 
 
 def robot(path: Path) -> Path:
@@ -92,7 +92,7 @@ def record(root: Path, kind: str, mode: str, endpoint: str = "") -> Path:
     network = ("--set", f"transport={{type: zenoh, connect: [{endpoint}]}}") if endpoint else ()
     done = run_here(
         "launch", robot(root / "cube.yaml"), "--sim", "--headless", "--lockstep", "--episodes", 1,
-        "--mode", "learned", "--set", f"contract.max_duration_s={_DURATION_S.get(kind, 0.5)}",
+        "--mode", "learned", "--set", f"contract.max_duration_s={_DURATION_S.get(kind, 0.2)}",
         "--set", "models.act.threads=1",
         "--set", f"models.act.path={checkpoint}", "--set", f"recording.root={root / kind}-{mode}",
         "--set", "recording.type=mcap",

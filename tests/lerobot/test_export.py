@@ -29,7 +29,7 @@ from checkpoints import CONFIGS, act, diffusion, save, vqbet
 pytestmark = pytest.mark.lerobot
 
 TOLERANCE = 2e-5
-OBSERVATIONS = 100
+OBSERVATIONS = 25
 
 
 LONG = [pytest.param(name, marks=pytest.mark.long) for name in ("act", "diffusion")]

@@ -434,6 +434,7 @@ class TestDiffusion(Conformance):
     ignores = frozenset({"observation.images.top", "observation.state"})  # untrained, it draws what is clipped anyway
 
 
+@pytest.mark.long
 class TestVqbet(Conformance):
     name = "vqbet"
     ignores = frozenset({"observation.images.top", "observation.state"})  # untrained, it takes the same codes for all

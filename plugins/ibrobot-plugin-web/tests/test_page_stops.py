@@ -280,7 +280,11 @@ PATIENCE_S = 1.0
 """Slack for a machine that runs other tests, too; an idle one needs none."""
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: str(row.__name__))
+@pytest.mark.parametrize(
+    "row",
+    [pytest.param(each, marks=[pytest.mark.long] if each is renderer_stalls else []) for each in ROWS],
+    ids=lambda row: str(row.__name__),
+)
 def test_a_press_that_outlives_an_event_moves_nothing(
     stage: Stage, row: Callable[[Scene, str], Awaitable[int]]
 ) -> None:

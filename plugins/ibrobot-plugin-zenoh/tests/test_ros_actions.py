@@ -157,7 +157,7 @@ def test_a_stop_by_service_ends_a_goal(robot: Any):
     assert not runtime.session.faults
 
 
-@pytest.mark.parametrize("stall_s", [0.1, 0.7, 1.6, 5.0])
+@pytest.mark.parametrize("stall_s", [0.1, *(pytest.param(each, marks=pytest.mark.long) for each in (0.7, 1.6)), 5.0])
 def test_a_goal_from_before_a_stop_moves_nothing_after_its_reset(
     robot: Any, stall_s: float, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
