@@ -51,6 +51,11 @@ POSTS = {"post": box(0.16, 0.0, 0.1, 0.03, 0.03, 0.2), "wall": box(-0.2, 0.0, 0.
 MARGIN_M = 0.003
 
 
+def few(values: range, every: int) -> list[Any]:
+    """Parameters that differ in number, not in kind; but for each of so many, they are long."""
+    return [pytest.param(each, marks=[pytest.mark.long] if i % every else []) for i, each in enumerate(values)]
+
+
 class Loop:
     """The safety layer with the guard, in ticks; the joints follow exactly unless `measured` is given."""
 
@@ -157,7 +162,7 @@ def switching(robot: Robot, rng: np.random.Generator) -> Iterator[Vector]:
 COMMANDERS = (random_targets, bang_bang, walk, down, switching)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
 @pytest.mark.parametrize("commander", COMMANDERS)
 def test_no_command_touches_anything(tmp_path, commander, seed: int) -> None:
     loop = Loop(tmp_path, floor=0.0, may_touch={"floor": ("base", "turret")})
@@ -206,7 +211,7 @@ def test_joints_that_lead_no_nearer_go_on(tmp_path) -> None:
     assert loop.guard.overruled == ""
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", few(range(12), 4))
 def test_from_near_anything_the_way_out_is_free(tmp_path, seed: int) -> None:
     """Wherever a command has led, the way that it came is free, and so is the pose above."""
     loop = Loop(tmp_path, floor=0.0, may_touch={"floor": ("base", "turret")})
@@ -253,7 +258,7 @@ def test_a_pair_that_was_nearer_once_is_measured_until_it_has_parted(tmp_path) -
     assert pairs.limits[near].min() > 0.0019
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", few(range(10), 3))
 def test_an_object_that_appears_is_stopped_in_front_of(tmp_path, seed: int) -> None:
     rng = np.random.default_rng(seed)
     loop, seen = Loop(tmp_path, LEFT), Seen(WALL)
@@ -796,7 +801,7 @@ def test_messages_of_every_kind_neither_break_the_loop_nor_lose_the_wall(tmp_pat
     assert loop.go(ACROSS)[0] > 0
 
 
-@pytest.mark.parametrize("at", range(0, 60, 4))
+@pytest.mark.parametrize("at", few(range(0, 60, 4), 4))
 @pytest.mark.parametrize("deleted", [("wall",), ("post", "wall"), ("post", "wall", "nothing")])
 def test_a_world_that_is_deleted_in_motion_and_comes_back(tmp_path, at: int, deleted: tuple[str, ...]) -> None:
     """While it is gone the way is free; what comes back is avoided from where braking leads."""
