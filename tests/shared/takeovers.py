@@ -29,11 +29,11 @@ import pytest
 from ibrobot_calibration import Calibration, JointCalibration
 from ibrobot_data.commanders import Commanders
 from ibrobot_data.episode import DATASET, Job, convert_episode
-from ibrobot_data.options import HANDOVER, OPERATOR, POLICY
 from ibrobot_data.request import ConversionRequest
 from ibrobot_data.ticks import Ticks, frames
 from ibrobot_feetech.calibration import save_calibration
 from ibrobot_lerobot.options import LeRobotOptions
+from ibrobot_provenance.recorded_names import HANDOVER, OPERATOR, POLICY
 from ibrobot_webxr.messages import HandPose, Hands
 from ibrobot_webxr.options import WebxrOptions
 from ibrobot_webxr.shared import close_page, open_page

@@ -13,6 +13,8 @@ from ibrobot_kinematics.urdf import read_urdf
 
 BASE_FRAMES = ("", "base", "base_link")
 """Names of the base frame beside that of the root of the URDF."""
+SHAPES = "/world/shapes"
+"""The service that answers with the objects around the robot, in the base frame."""
 _FURTHEST = 1000.0
 """Greatest coordinate of a frame [m]."""
 _NEARLY_ONE = 1e-3

@@ -8,8 +8,10 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from operator import itemgetter
 
+from ibrobot_provenance.recorded_names import COMMANDER, OPERATOR, POLICY
+
 from ibrobot_core.api import EpisodeReader, EpisodeSummary, RecorderError, String
-from ibrobot_data.options import COMMANDER, OPERATOR, PLANNER, POLICY
+from ibrobot_data.options import PLANNER
 
 
 def is_labelled(summary: EpisodeSummary) -> bool:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any, Protocol, override
 
 import attrs
+from ibrobot_provenance.recorded_names import COMMANDER, HANDOVER, OPERATOR, POLICY
 from ibrobot_terminal import HeldKeys
 
 from ibrobot_core.api import (
@@ -29,7 +30,7 @@ from ibrobot_core.app import (
     StreamingRun,
 )
 from ibrobot_data.handover import Handover
-from ibrobot_data.options import COMMANDER, HANDOVER, OPERATOR, POLICY, EpisodesOptions, has_button, options_of
+from ibrobot_data.options import EpisodesOptions, has_button, options_of
 
 
 @documented

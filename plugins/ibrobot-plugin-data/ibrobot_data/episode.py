@@ -21,6 +21,7 @@ from ibrobot_calibration.joint_units import recorded_units
 from ibrobot_provenance.datasets import DatasetWriter
 from ibrobot_provenance.files import sync
 from ibrobot_provenance.ownership import Ownership
+from ibrobot_provenance.recorded_names import OPERATOR, POLICY
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
@@ -42,7 +43,6 @@ from ibrobot_data.commanders import Commanders, is_labelled, stretches
 from ibrobot_data.errors import DiskFull
 from ibrobot_data.growing import GrowingEpisode
 from ibrobot_data.identity import identity
-from ibrobot_data.options import OPERATOR, POLICY
 from ibrobot_data.request import ConversionRequest, EpisodeReport
 from ibrobot_data.ticks import TASK_KEY, Ticks
 

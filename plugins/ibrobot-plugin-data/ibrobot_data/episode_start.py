@@ -10,13 +10,16 @@ from uuid import NAMESPACE_OID, uuid4, uuid5
 
 from ibrobot_calibration.joint_units import calibrations
 from ibrobot_provenance.ownership import InUse, Ownership
+from ibrobot_provenance.recorded_names import COMMANDER, GUARD
+from ibrobot_terminal.authority import AGENT_LOG
 
 import ibrobot_core
 from ibrobot_core.api import MODEL_ANSWERS, Contract, EpisodeStart, ModelAnswer, RecorderError, String
 from ibrobot_core.app import RecordedRun, RobotConfig
 from ibrobot_data.episode_dataset import EpisodeDataset
-from ibrobot_data.options import GUARD, LABELS
 
+LABELS = (COMMANDER, GUARD, AGENT_LOG)
+"""Topics beside those of the contract: who commanded, what the guard of control kept apart, what agents asked for."""
 _PREFIX = "episode_"
 
 

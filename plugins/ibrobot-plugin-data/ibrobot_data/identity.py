@@ -9,6 +9,7 @@ from typing import Any
 from uuid import UUID
 
 import attrs
+from ibrobot_provenance.recorded_names import TRIMMED_FROM
 
 from ibrobot_core.api import DatasetError, EpisodeReader, EpisodeSummary
 
@@ -16,7 +17,6 @@ UUID_KEY = "uuid"
 """Key of the metadata. The value is random for a live recording, and derived from the other metadata in lockstep."""
 
 
-TRIMMED_FROM = "trimmed_from"
 """Key of the metadata of a part of an episode: the recordings that contain it, see `recording_of`."""
 
 

@@ -13,13 +13,6 @@ if TYPE_CHECKING:
     from ibrobot_core.api import Robot
     from ibrobot_core.app import RobotConfig, RunView
 
-COMMANDER = "/commander"
-"""Topic (std_msgs/msg/String) with who commands the robot at each state of control, in modes with `intervene`."""
-GUARD, AGENTS = "/guard", "/agent/log"
-LABELS = (COMMANDER, GUARD, AGENTS)
-"""Topics beside those of the contract: who commanded, what the guard of control kept apart, what agents asked for."""
-POLICY, OPERATOR, HANDOVER = "policy", "operator", "handover"
-"""The words on `COMMANDER`; in a handover nobody commands, and the arm holds."""
 PLANNER = "planner"
 """Who commands in the episodes of a mode with a planner."""
 

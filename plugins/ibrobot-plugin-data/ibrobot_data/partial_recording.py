@@ -8,9 +8,11 @@ from functools import partial
 from types import NoneType
 from typing import override
 
+from ibrobot_provenance.recorded_names import COMMANDER, POLICY
+
 from ibrobot_core.api import EpisodeEnd, RecorderError, String, ns
 from ibrobot_core.app import NoRequest, Received, RecordedRun, Service
-from ibrobot_data.options import COMMANDER, POLICY, EpisodesOptions
+from ibrobot_data.options import EpisodesOptions
 from ibrobot_data.recording_worker import RecordingWorker
 
 HIGHLIGHT = Service("/record_episode/highlight", NoRequest, NoneType, "Begin or end a highlight, as its key does.")

@@ -22,9 +22,9 @@ from ibrobot_data.command import Convert, conversion_request
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.growing import GrowingEpisode
 from ibrobot_data.operator import Operator
-from ibrobot_data.options import COMMANDER
 from ibrobot_data.run import follow, stage
 from ibrobot_data.written import WrittenEpisode
+from ibrobot_provenance.recorded_names import COMMANDER
 from ibrobot_testing.site import made_up_site
 
 from ibrobot_core.api import RecorderError, String

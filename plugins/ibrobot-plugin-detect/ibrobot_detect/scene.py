@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import override
 
+from ibrobot_kinematics.run_frames import SHAPES
+
 from ibrobot_core.api import PlanningError, SceneObject
 from ibrobot_core.app import RunView
 from ibrobot_detect.detector import Detection, Detector, Sight, box_of, fits
 from ibrobot_detect.options import SceneOptions
 
-_SHAPES = "/world/shapes"
 """The service of the section `world`."""
 
 
@@ -27,11 +28,11 @@ class SceneDetector(Detector):
 
     @override
     def find(self, name: str, sights: Sequence[Sight]) -> Sequence[Detection]:
-        if not self._bus.serves(_SHAPES):
+        if not self._bus.serves(SHAPES):
             raise PlanningError(
                 "nothing knows the objects: the robot YAML needs the section `world`, e.g. `world: {scene: true}`"
             )
-        things: Sequence[SceneObject] = self._bus.call(_SHAPES)
+        things: Sequence[SceneObject] = self._bus.call(SHAPES)
         chosen = fits(name, [each.name for each in things]) if name else [each.name for each in things]
         return [_detected(each, sights) for each in things if each.name in chosen]
 

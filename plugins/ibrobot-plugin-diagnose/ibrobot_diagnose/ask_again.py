@@ -14,6 +14,7 @@ from typing import Any
 import attrs
 import numpy as np
 from ibrobot_calibration.joint_units import recorded_units
+from ibrobot_provenance.recorded_names import ATTENTION
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
@@ -33,7 +34,6 @@ from ibrobot_core.app import FrameAssembler, RobotConfig, from_document, install
 from ibrobot_diagnose.pictures import Shown, reddened
 from ibrobot_diagnose.window import Asked, Floats, Window
 
-_ATTENTION = "attention."
 """Prefix of outputs that say where a model looks in a picture, of shape (h, w)."""
 _log = logging.getLogger("ibrobot.diagnose")
 _MOST, _MOST_OF_PARTS = 8, 3
@@ -189,8 +189,8 @@ class Model:
         if frame.missing:
             return {}
         outputs = self._outputs(frame, self.window.prompt)
-        looks = {name: np.asarray(array, np.float64) for name, array in outputs.items() if name.startswith(_ATTENTION)}
-        return {name.removeprefix(_ATTENTION): each for name, each in looks.items()}
+        looks = {name: np.asarray(array, np.float64) for name, array in outputs.items() if name.startswith(ATTENTION)}
+        return {name.removeprefix(ATTENTION): each for name, each in looks.items()}
 
     def _outputs(self, frame: Frame, prompt: str) -> Tensors:
         frame = self._units.frame(attrs.evolve(frame, prompt=prompt))

@@ -14,6 +14,7 @@ from typing import Any
 import attrs
 import numpy as np
 from ibrobot_provenance.files import replace_file
+from ibrobot_provenance.recorded_names import CARD
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Contract, DatasetError
@@ -24,8 +25,6 @@ from ibrobot_diagnose.recorded_rig import rig_of
 from ibrobot_diagnose.rig import Rig
 from ibrobot_diagnose.window import Camera, Floats, Limits, Window
 
-FILE = "reference.json"
-"""Name of the card in the folder of a checkpoint or a dataset."""
 SCHEMA, VERSION = "ibrobot card", 1
 LEVELS = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 1.0)
 WAY = 16
@@ -629,4 +628,4 @@ def make_card(windows: Iterable[Window], **more: Any) -> Card:
 
 def with_card(folders: Sequence[Path]) -> Path | None:
     """The first card in these folders; None if none has one."""
-    return next((folder / FILE for folder in folders if (folder / FILE).is_file()), None)
+    return next((folder / CARD for folder in folders if (folder / CARD).is_file()), None)

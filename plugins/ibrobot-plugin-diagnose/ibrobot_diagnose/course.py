@@ -10,10 +10,11 @@ from typing import Any
 
 import attrs
 import numpy as np
+from ibrobot_provenance.recorded_names import OPERATOR
 from numpy.typing import NDArray
 
 from ibrobot_core.api import NS_PER_S
-from ibrobot_diagnose.window import OPERATOR, Asked, Floats, Times, Window
+from ibrobot_diagnose.window import Asked, Floats, Times, Window
 
 type Flags = NDArray[np.bool_]
 

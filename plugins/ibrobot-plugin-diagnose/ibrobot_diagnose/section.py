@@ -6,12 +6,12 @@ import os
 from pathlib import Path
 from typing import Any, override
 
+from ibrobot_provenance.recorded_names import CARD
+
 from ibrobot_core.api import HardwareError, IbrobotError, ns
 from ibrobot_core.app import CONTROL, Component, RobotConfig, RunView
 from ibrobot_diagnose.options import SECTION, PreflightSection
 from ibrobot_diagnose.references import RIG
-
-_CHECKPOINT = "reference.json"
 
 
 def reference_for(config: RobotConfig) -> Path | None:
@@ -26,7 +26,7 @@ def reference_for(config: RobotConfig) -> Path | None:
         return None
     model = (config.document.get("models") or {}).get(mode.inference.model)
     path = model.get("path") if isinstance(model, dict) else None
-    known = Path(path) / _CHECKPOINT if isinstance(path, str | os.PathLike) else None
+    known = Path(path) / CARD if isinstance(path, str | os.PathLike) else None
     return known if known is not None and known.is_file() else None
 
 

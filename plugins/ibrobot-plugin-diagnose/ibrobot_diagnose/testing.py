@@ -14,6 +14,7 @@ from ibrobot_testing.suite import Suite
 from numpy.typing import ArrayLike, NDArray
 
 from ibrobot_core.api import (
+    JOINT_STATES,
     MODEL_ANSWERS,
     NS_PER_S,
     ActionPart,
@@ -42,7 +43,7 @@ from ibrobot_diagnose.diagnosis import STREAMS, diagnose
 from ibrobot_diagnose.window import Track, Window, read_window
 
 START_NS = 1_700_000_000 * NS_PER_S
-_STATES, _COMMANDS = "/joint_states", "/commands"
+_COMMANDS = "/commands"
 
 
 @attrs.frozen(eq=False)
@@ -91,7 +92,7 @@ def make_window(
 
 def _contract(joints: Sequence[str], rate_hz: float, pictures: Mapping[str, NDArray[np.uint8]]) -> Contract:
     state = ObservationPart(
-        "observation.state", _STATES, JointState.ros_type, tuple(f"position.{each}" for each in joints), None,
+        "observation.state", JOINT_STATES, JointState.ros_type, tuple(f"position.{each}" for each in joints), None,
         Align(), Feature("float32", (len(joints),), tuple(f"{each}.pos" for each in joints)),
     )  # fmt: skip
     action = ActionPart("work", _COMMANDS, Float64MultiArray.ros_type, "hold", tuple(joints))
@@ -110,7 +111,7 @@ def _messages(
     """Time of receipt [ns], topic and message of all that was recorded."""
     for tick, (state, command) in enumerate(zip(states, commands, strict=True)):
         t_ns = START_NS + tick * contract.step_ns
-        yield t_ns, _STATES, JointState(Header(t_ns), joints, state)
+        yield t_ns, JOINT_STATES, JointState(Header(t_ns), joints, state)
         yield t_ns, _COMMANDS, Float64MultiArray(command)
         for camera, shown in pictures.items():
             height, width, _ = shown[tick].shape

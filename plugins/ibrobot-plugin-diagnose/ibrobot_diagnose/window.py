@@ -12,6 +12,7 @@ from typing import Any
 
 import attrs
 import numpy as np
+from ibrobot_provenance.recorded_names import COMMANDER, GUARD
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
@@ -35,9 +36,6 @@ from ibrobot_diagnose.rig import STILL_WIDTH, Rig
 type Floats = NDArray[np.float64]
 type Times = NDArray[np.int64]
 
-COMMANDER = "/commander"
-GUARD = "/guard"
-OPERATOR = "operator"
 COMPARED = 60
 """Pictures of each camera that are compared with the data."""
 KEPT = 48

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from ibrobot_provenance.recorded_names import ATTENTION
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from ibrobot_core.api import Policy, PolicyError, Tensors
 from ibrobot_lerobot.attention import Attention
-from ibrobot_lerobot.checkpoint import ACTION, ATTENTION, Checkpoint
+from ibrobot_lerobot.checkpoint import ACTION, Checkpoint
 from ibrobot_lerobot.draws import Draw, Draws, NotByRequest
 from ibrobot_lerobot.options import LeRobotPolicyOptions
 from ibrobot_lerobot.policy_types import import_others

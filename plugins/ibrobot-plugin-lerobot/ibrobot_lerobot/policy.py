@@ -11,12 +11,12 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, override
 
 import numpy as np
+from ibrobot_provenance.recorded_names import ATTENTION
 from numpy.typing import NDArray
 
 from ibrobot_core.api import Context, Frame, Header, Image, PictureCodec, Policy, PolicyError, PolicySpec, Tensors
 from ibrobot_lerobot.checkpoint import (
     ACTION,
-    ATTENTION,
     POSTPROCESSOR,
     PREPROCESSOR,
     check_weights,

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ibrobot_provenance.ownership import owned
+from ibrobot_provenance.recorded_names import CARD
 
 from ibrobot_core.api import DatasetError, IbrobotError
 from ibrobot_core.app import echo, installed_plugins
@@ -38,7 +39,7 @@ _REPORTS = 200
 """Reports of progress in a training."""
 _END_S = 10.0
 INTERRUPTED = 130
-CARD, CARD_FILE = "datasets card", "reference.json"
+_MAKES_CARDS = "datasets card"
 """The command that makes a card of a dataset, and its file beside a checkpoint."""
 _WHEN_CONTINUING = ("--policy.device", "--steps", "--save_freq", "--log_freq", "--output_dir")
 """Arguments of a command that continues a training; LeRobot takes the others from the checkpoint."""
@@ -96,7 +97,7 @@ def run_training(options: TrainOptions, follow: Follow | None) -> tuple[int, Tra
 
 def _write_card(options: TrainOptions, newest: TrainingCheckpoint) -> None:
     """Write the card of the data beside the checkpoint, if a plugin offers the command for it."""
-    command = installed_plugins().commands.get(CARD)
+    command = installed_plugins().commands.get(_MAKES_CARDS)
     if command is None:
         return
     facts = {
@@ -104,7 +105,7 @@ def _write_card(options: TrainOptions, newest: TrainingCheckpoint) -> None:
         "dataset": options.dataset.resolve().name,
     }  # fmt: skip
     try:
-        command.options(dataset=options.dataset, out=newest.policy / CARD_FILE, trained=json.dumps(facts))()
+        command.options(dataset=options.dataset, out=newest.policy / CARD, trained=json.dumps(facts))()
     except (IbrobotError, SystemExit) as error:  # the training itself is done
         echo(f"no card of the data was written beside the checkpoint: {error}", err=True)
 

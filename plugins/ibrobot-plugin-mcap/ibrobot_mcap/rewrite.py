@@ -10,6 +10,7 @@ from pathlib import Path
 from uuid import NAMESPACE_OID, UUID, uuid5
 
 import attrs
+from ibrobot_provenance.recorded_names import TRIMMED_FROM
 
 from ibrobot_core.api import EpisodeStart, EpisodeSummary, RecorderError
 from ibrobot_mcap.bagfile import Item
@@ -21,7 +22,6 @@ from ibrobot_mcap.storage import Storage
 
 REPAIRED = "repaired"
 """Key of `custom_data` that states that an episode was repaired."""
-TRIMMED_FROM = "trimmed_from"
 """Key of the recordings that contain an episode, newest last, by UUID or, without one, by digest."""
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from ibrobot_ros2 import decode, encode
 from ibrobot_ros2.interfaces import fields_of
+from ibrobot_ros2.offers import CLOCK, CLOCK_TYPE
 
 from ibrobot_core.api import MESSAGE_TYPES, NS_PER_S, IbrobotError, JointState
 from ibrobot_core.app import Channel, Received, RunView, Subscription
@@ -16,8 +17,6 @@ from ibrobot_ros.options import NAME, Ros2ControlOptions, RosOptions
 
 type Frame = tuple[dict[str, Any], bytes]
 """A message for the node, with the bytes of a message of ROS."""
-CLOCK = "/clock"
-_CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 _CLOCK_CDR = struct.Struct("<4siI")
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 GLOBAL = ("/tf", "/tf_static", CLOCK)
@@ -181,7 +180,7 @@ class Topics:
     def _clock_frames(self, now_ns: int) -> list[Frame]:
         frames: list[Frame] = []
         if CLOCK not in self._declared:
-            self._declared[CLOCK] = _CLOCK_TYPE
-            frames.append(({"op": "publisher", "topic": CLOCK, "type": _CLOCK_TYPE, "qos": "sensor_data"}, b""))
+            self._declared[CLOCK] = CLOCK_TYPE
+            frames.append(({"op": "publisher", "topic": CLOCK, "type": CLOCK_TYPE, "qos": "sensor_data"}, b""))
         text = _CLOCK_CDR.pack(_LITTLE_ENDIAN, *divmod(now_ns, NS_PER_S))
         return [*frames, ({"op": "message", "topic": CLOCK}, text)]

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import attrs
+from ibrobot_kinematics.run_frames import SHAPES
 
 from ibrobot_core.api import Float64MultiArray, IbrobotError, SceneObject, Vector
 from ibrobot_core.app import RobotConfig, RunView, Subscription
 
-SHAPES = "/world/shapes"
 _POSE_SIZE = 7
 _log = logging.getLogger("ibrobot.web")
 

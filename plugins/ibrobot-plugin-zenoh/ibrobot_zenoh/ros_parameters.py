@@ -8,13 +8,13 @@ from enum import IntEnum
 from typing import Any, override
 
 from ibrobot_ros2.interfaces import service_type
+from ibrobot_ros2.offers import SET_MODE
 
 from ibrobot_core.api import IbrobotError
 from ibrobot_core.app import Component, RunView, dump_yaml
 from ibrobot_zenoh.arrivals import Arrivals
 from ibrobot_zenoh.network import Link, Reply, transport_of
 
-_SET_MODE = "/set_mode"
 MODE = "mode"
 """The parameter that is the control mode."""
 
@@ -136,15 +136,15 @@ class RosParameters(Component):
         reply({"results": [self._set_one(each["name"], each["value"], sent_ns) for each in given]})
 
     def _set_one(self, name: str, value: Mapping[str, Any], sent_ns: int) -> dict[str, Any]:
-        if name == MODE and self._is_shared(_SET_MODE):
+        if name == MODE and self._is_shared(SET_MODE):
             try:
-                self._arrivals.check(_SET_MODE, sent_ns)
-                self._session.bus.call(_SET_MODE, {"mode": from_parameter(value)})
+                self._arrivals.check(SET_MODE, sent_ns)
+                self._session.bus.call(SET_MODE, {"mode": from_parameter(value)})
             except (IbrobotError, ValueError) as error:
                 return {"successful": False, "reason": str(error)}
             return {"successful": True}
         if name == MODE:
-            reason = f"{_SET_MODE} is not shared; transport.share.services of the robot lists what is"
+            reason = f"{SET_MODE} is not shared; transport.share.services of the robot lists what is"
         elif name in self._values:
             reason = f"is read when a run starts: `ibrobot launch … --set {name}=…`"
         else:

@@ -14,7 +14,10 @@ from ibrobot_core.app import RunView, Service
 from ibrobot_ros2.services import plain
 
 TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
-_SET_MODE = "/set_mode"
+SET_MODE = "/set_mode"
+"""The service that enters another control mode."""
+CLOCK, CLOCK_TYPE = "/clock", "rosgraph_msgs/msg/Clock"
+"""The topic of simulated time in ROS, and its type."""
 _NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 
 
@@ -68,7 +71,7 @@ class Offers:
         for name, service in self._session.bus.services().items():
             if not self._is_chosen(name):
                 continue
-            if name == _SET_MODE:
+            if name == SET_MODE:
                 for mode in self._session.config.control_modes:
                     offers[f"{name}/{mode}"] = Offer(TRIGGER, name, {"mode": mode})
             elif (kind := ros_type(service)) is not None:

@@ -26,13 +26,15 @@ class MakeCard:
 
     @wrong_input()
     def __call__(self) -> None:
-        from ibrobot_diagnose.card import FILE, make_card
+        from ibrobot_provenance.recorded_names import CARD
+
+        from ibrobot_diagnose.card import make_card
 
         try:
             trained = json.loads(self.trained) if self.trained else None
         except ValueError as error:
             raise RequestError(f"--trained: is not JSON: {error}") from None
         card = make_card(windows_of(self.dataset), trained=trained)
-        out = self.out or self.dataset / FILE
+        out = self.out or self.dataset / CARD
         card.write(out)
         echo(f"card of {card.episodes} episodes, {card.frames} frames -> {out}", err=True)

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+from ibrobot_ros2.offers import SET_MODE
 
 from ibrobot_core.api import CompressedImage, IbrobotError, Image, PlanningError, Vector, ns, seconds
 from ibrobot_core.app import RunView
@@ -39,7 +40,6 @@ from ibrobot_planning.world.section import ATTACH, DETACH, TOUCH
 
 BEGIN_EPISODE, END_EPISODE = "/record_episode/start", "/record_episode/stop"
 """Services of a run that records: take a prompt, and an outcome."""
-_SET_MODE = "/set_mode"
 _GRASP_RAD = 0.01
 """A gripper that comes closer to its goal has grasped nothing; used if its executor has no tolerance."""
 _ALIVE_NS = ns(2.0)
@@ -177,7 +177,7 @@ class Performance:
 
     def _enter(self, mode: str, prompt: str = "") -> None:
         if prompt or self._session.mode != mode:  # the policy of the present mode may have another prompt
-            self._session.bus.call(_SET_MODE, {"mode": mode, "prompt": prompt})
+            self._session.bus.call(SET_MODE, {"mode": mode, "prompt": prompt})
 
     # Steps.
 
@@ -333,7 +333,7 @@ class Performance:
             # Leave the mode, so that the policy stops.
             if recorded and session.bus.serves(END_EPISODE):
                 session.bus.call(END_EPISODE, outcome)
-            if session.bus.serves(_SET_MODE):
+            if session.bus.serves(SET_MODE):
                 self._enter(self.checked.mode.name)
         return {"success": solved} if step.until == "success" else {}
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import attrs
 from ibrobot_ros2.convert import make_class
 from ibrobot_ros2.definitions import standard_types
+from ibrobot_ros2.offers import CLOCK, CLOCK_TYPE
 
 from ibrobot_core.api import (
     NS_PER_S,
@@ -30,8 +31,6 @@ from ibrobot_core.api import (
 from ibrobot_core.app import RequestError, echo, installed_plugins, wrong_input
 from ibrobot_zenoh.commands.network import OnNetwork
 
-CLOCK = "/clock"
-_CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 _LATCHED = ("/tf_static", "/robot_description")
 """Topics whose last message is for later subscribers, too."""
 _COMMAND_TYPES = ("trajectory_msgs/msg/JointTrajectory", "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped")
@@ -107,7 +106,7 @@ class Player:
 
     def play(self, messages: Iterator[Recorded], start_ns: int) -> None:
         """Publish messages, the first of which may be at `start_ns` [ns]; returns after the last one."""
-        began_ns, clock = self.clock.now_ns(), make_class(_CLOCK_TYPE, standard_types())
+        began_ns, clock = self.clock.now_ns(), make_class(CLOCK_TYPE, standard_types())
         step_ns = None if self.clock_hz is None else max(1, round(NS_PER_S * self.rate / self.clock_hz))
         ticks = 0
         for each in messages:
