@@ -710,3 +710,19 @@ def test_two_of_many_joints_that_are_exchanged_are_named():
     (first, *_) = diagnose(exchanged, card).findings
     assert first.name == "joint_order"
     assert "joint_1 behaves as joint_5, joint_5 behaves as joint_1" in first.evidence.text
+
+
+@pytest.mark.parametrize("tremble", [0.0, 0.3])
+@pytest.mark.parametrize(
+    "pose", [(-0.7, -0.4, 0.5), (-0.6, -0.1, 0.0), (0.4, -0.6, -0.2), (0.5, 0.3, 0.3), (0.7, 0.2, 0.2)]
+)
+def test_arm_that_stays_where_the_data_never_was_has_no_shifted_zero(data, pose, tremble):
+    """All its pictures resemble one of the data, at another pose: they count once."""
+    rng = np.random.default_rng(1)
+
+    def stays(chunk: Any) -> Any:
+        goal = np.array([*pose, 0.0]) + rng.uniform(-tremble, tremble, 4)
+        return np.broadcast_to(goal, chunk.shape).astype(chunk.dtype)
+
+    run = window_of(Run(seed=9501, outcome="failure", answered=stays, **{**ONE, "seconds": 8}))
+    assert "joint_zero" not in names_of(run, data)

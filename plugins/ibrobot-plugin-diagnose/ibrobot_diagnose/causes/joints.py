@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Iterator
 from typing import override
 
+import attrs
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +19,10 @@ from ibrobot_diagnose.window import Floats, Window, grips
 _MIDDLE = slice(1, -1)
 """Levels of the quantiles that are compared."""
 _MOST_JOINTS = 64
+_LIKE = 1.2
+"""How far pictures that look the same are from each other at most, in times of the usual distance."""
+_STEP = 0.05
+"""How far poses are from each other that count as two [rad]."""
 _REPEATS = 0.6
 """Usual distance up to which pictures of a camera repeat, so that they say something of the pose."""
 _CONSEQUENCES = frozenset({
@@ -54,21 +59,60 @@ def _repeats(pair: Pair) -> bool:
     return pair.card.usual_distance <= _REPEATS
 
 
-def nearest_poses(window: Window, card: Card) -> tuple[Floats, Floats]:
-    """Positions of the joints in the window, and those of the data at pictures that look the same; shape (N, J)."""
-    own, theirs = [], []
+@attrs.frozen
+class LikePoses:
+    """Positions of the joints in the window, and in the data at pictures that look the same."""
+
+    own: Floats
+    """[rad], shape (N, J)."""
+    theirs: Floats
+    """[rad], shape (N, J)."""
+    weights: Floats
+    """The more alike the pictures, the more a pose weighs; shape (N,)."""
+    begins: NDArray[np.bool_]
+    """Which ones are the pose in which the run began; shape (N,)."""
+
+
+def like_poses(window: Window, card: Card) -> LikePoses:
+    """Poses at pictures that look the same, each a step away from the others, in the window and in the data.
+
+    An arm that stands still or trembles where the data never was, and so resembles one other pose of the data, says no
+    more than one that passes it.
+    """
+    size = len(window.joints)
+    own, theirs, weights, begins = [np.empty((0, size))], [np.empty((0, size))], [np.empty(0)], [np.empty(0, np.bool_)]
     for pair in pairs(window, card):
         if not _repeats(pair):
             continue
         times = np.array(pair.camera.times_ns, np.int64)
         index = np.unique(np.linspace(0, len(times) - 1, min(120, len(times))).round().astype(int))
         distance, near = nearest(descriptors(pair.camera.small[index]), pair.card.vectors)
-        states = window.state.at(times[index])
-        good = (distance < 1.5 * pair.card.usual_distance) & np.isfinite(states).all(axis=1)
-        own.append(states[good])
-        theirs.append(pair.card.poses[near[good]])
-    size = len(window.joints)
-    return (np.concatenate(own), np.concatenate(theirs)) if own else (np.empty((0, size)), np.empty((0, size)))
+        states, data = window.state.at(times[index]), pair.card.poses[near]
+        alike = 1.0 - distance / max(_LIKE * pair.card.usual_distance, 1e-6)
+        kept: list[int] = []
+        for i in (0, *(np.argsort(-alike[1:]) + 1).tolist()):
+            if alike[i] > 0 and np.isfinite(states[i]).all() and _away(states, i, kept) and _away(data, i, kept):
+                kept.append(i)
+        own.append(states[kept])
+        theirs.append(data[kept])
+        weights.append(alike[kept] ** 2)
+        begins.append(np.array(kept) == 0)
+    return LikePoses(*(np.concatenate(each) for each in (own, theirs, weights, begins)))
+
+
+def _away(poses: Floats, i: int, kept: list[int]) -> bool:
+    """Whether a pose is a step away from those that are kept."""
+    return not kept or bool(np.abs(poses[kept] - poses[i]).max(axis=1).min() >= _STEP)
+
+
+def _weighted_quantile(values: Floats, weights: Floats, share: float) -> Floats:
+    """The value of each column up to which that share of the weights lies; shape (J,)."""
+    order = np.argsort(values, axis=0)
+    sums = np.cumsum(weights[order], axis=0)
+    row = (sums < share * sums[-1]).sum(axis=0)
+    columns = np.arange(values.shape[1])
+    result: Floats = values[order[row, columns], columns]
+    return result
 
 
 def usual_offsets(card: Card) -> Floats:
@@ -265,12 +309,13 @@ class JointZero(CardCause):
     def compare(self, window: Window, card: Card) -> Evidence | None:
         if not _same(window, card):
             return None
-        own, theirs = nearest_poses(window, card)
-        if len(own) < 10:
+        poses = like_poses(window, card)
+        if len(poses.own) < 5:
             return None
-        differences = own - theirs
-        middle = np.median(differences, axis=0)
-        spread = 1.4826 * np.median(np.abs(differences - middle), axis=0)
+        differences = poses.own - poses.theirs
+        middle = _weighted_quantile(differences, poses.weights, 0.5)
+        # Of three quarters: a gripper that is open in half of the pictures, and shut in the other, has no zero.
+        spread = 0.87 * _weighted_quantile(np.abs(differences - middle), poses.weights, 0.75)
         sure = np.abs(middle) / (0.04 + 0.5 * spread + usual_offsets(card))
         j = int(np.argmax(sure))
         others = np.delete(sure, j)
@@ -282,7 +327,11 @@ class JointZero(CardCause):
             f"{joint}: {off:+.3f} rad, scattered by {width:.3f}"
             for joint, off, width in zip(window.joints, middle.tolist(), spread.tolist(), strict=True)
         )
-        number = float(sure[j]) * (1.0 if not len(others) or others.max() < 0.7 * sure[j] else 0.7)
+        number = float(sure[j])
+        if others.max(initial=0.0) >= 0.7 * number:  # two that make up for each other look the same in pictures
+            number *= 0.45
+        if (np.abs(differences[poses.begins, j]) < 0.5 * abs(middle[j])).any():
+            number *= 0.4  # before the policy moved the arm, it stood where the data says
         if spread[j] > 0.6 * abs(middle[j]):
             number *= 0.5
         start = float(_known(window)[0, j] - np.median(card.starts[:, j]))
