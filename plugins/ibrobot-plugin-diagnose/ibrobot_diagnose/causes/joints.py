@@ -80,7 +80,10 @@ def like_poses(window: Window, card: Card) -> LikePoses:
     more than one that passes it.
     """
     size = len(window.joints)
-    own, theirs, weights, begins = [np.empty((0, size))], [np.empty((0, size))], [np.empty(0)], [np.empty(0, np.bool_)]
+    own: list[Floats] = [np.empty((0, size))]
+    theirs: list[Floats] = [np.empty((0, size))]
+    weights: list[Floats] = [np.empty(0)]
+    begins: list[NDArray[np.bool_]] = [np.empty(0, np.bool_)]
     for pair in pairs(window, card):
         if not _repeats(pair):
             continue
@@ -95,9 +98,9 @@ def like_poses(window: Window, card: Card) -> LikePoses:
                 kept.append(i)
         own.append(states[kept])
         theirs.append(data[kept])
-        weights.append(alike[kept] ** 2)
+        weights.append(np.square(alike[kept], dtype=np.float64))
         begins.append(np.array(kept) == 0)
-    return LikePoses(*(np.concatenate(each) for each in (own, theirs, weights, begins)))
+    return LikePoses(np.concatenate(own), np.concatenate(theirs), np.concatenate(weights), np.concatenate(begins))
 
 
 def _away(poses: Floats, i: int, kept: list[int]) -> bool:
