@@ -14,7 +14,7 @@ export class View {
   }
 
   mount(element) {
-    this.form = new Form(this.title, (values) => this.start(values));
+    this.form = new Form(this.title, this.command, (values) => this.start(values));
     const reports = this.reports.map((each) => h("a", { class: "button", href: `#${each.name}` }, each.title));
     element.append(h("div", { class: "row" }, h("h2", {}, this.title), reports), this.form.element, h("h2", {}, "Jobs"), this.jobs.element);
   }
@@ -33,15 +33,10 @@ export class View {
     const form = await this.ui.attempt(() => this.ui.get("jobs/form", { command: this.command }));
     if (!form) return;
     this.form.show(form, this.ui.drives);
-    if (!this.loaded) this.form.enter(JSON.parse(localStorage.getItem(this.key) ?? "{}")); // as it was sent last
-    this.loaded = true;
   }
-
-  get key() { return `form ${this.command}`; }
 
   async start(values) {
     this.form.button.disabled = true;
-    localStorage.setItem(this.key, JSON.stringify(values));
     const started = await this.ui.attempt(() => this.ui.post("jobs/start", { command: this.command, values }));
     this.form.button.disabled = !this.ui.drives;
     this.jobs.reveal(started, this.form.button);

@@ -3,8 +3,10 @@
 import { capital, h, refresh } from "../dom.js";
 
 export class Form {
-  // `title` is on the button; `submit` gets the values by name.
-  constructor(title, submit) {
+  // `title` is on the button; `command` is whose form it is, by which the browser remembers what was entered; `submit`
+  // gets the values by name.
+  constructor(title, command, submit) {
+    this.key = `entered ${command}`;
     this.fields = [];
     this.note = h("p", { class: "note" });
     this.first = h("div", { class: "fields form" });
@@ -12,8 +14,8 @@ export class Form {
     this.others = h("details", { hidden: true }, h("summary", {}, "More options"), this.more);
     this.button = h("button", { class: "primary", disabled: true }, title);
     this.element = h("form", { class: "card" }, this.note, this.first, this.others, h("div", { class: "row" }, this.button));
-    this.element.addEventListener("input", () => this.suggest());
-    this.element.addEventListener("submit", (event) => { event.preventDefault(); submit(this.values); });
+    this.element.addEventListener("input", () => { this.suggest(); this.remember(); });
+    this.element.addEventListener("submit", (event) => { event.preventDefault(); this.remember(); submit(this.values); });
   }
 
   get values() { return Object.fromEntries(this.fields.map(({ name, value }) => [name, value()])); }
@@ -22,6 +24,33 @@ export class Form {
   enter(values, alone = false) {
     for (const field of this.fields) if (field.name in values) field.enter(values[field.name]);
     if (alone) for (const field of this.fields) if (field.suggest && !(field.name in values)) field.enter("");
+    this.suggest();
+  }
+
+  // What a person entered, by name: neither what the form began with nor what it suggested.
+  get entered() {
+    const own = this.fields.filter((field) => !same(field.value(), field.initial) && !same(field.value(), field.suggested));
+    return Object.fromEntries(own.map((field) => [field.name, { value: field.value(), listed: field.lists(field.value()) }]));
+  }
+
+  remember() { localStorage.setItem(this.key, JSON.stringify(this.entered)); }
+
+  // Enters what a person had entered, without what was chosen from a list that has it no more.
+  recall(entered) {
+    for (const field of this.fields) {
+      if (!Object.hasOwn(entered, field.name)) continue;
+      const { value, listed } = entered[field.name];
+      const left = [value].flat().filter((each) => !listed || field.lists(each));
+      if (Array.isArray(value) ? left.length || !value.length : left.length) field.enter(Array.isArray(value) ? left : value);
+    }
+  }
+
+  // Suggests a value for a field, unless a person entered another.
+  propose(name, value) {
+    const field = this.fields.find((each) => each.name === name);
+    if (!field || (field.value() !== "" && field.value() !== field.suggested)) return;
+    field.suggested = value;
+    field.enter(value);
     this.suggest();
   }
 
@@ -47,9 +76,9 @@ export class Form {
     refresh(this.note, [summary, missing, lacking], () => [missing ? h("span", { class: "problem" }, missing)
       : lacking.length ? `The opened folders contain nothing for: ${lacking.map(({ label }) => label).join(", ")}.` : summary]);
     refresh(this.first, [fields, known], () => {
-      const entered = this.values;
+      const entered = this.fields.length ? this.entered : JSON.parse(localStorage.getItem(this.key) ?? "{}");
       this.fields = fields.map((field) => new Field(field, known[field.names] ?? []));
-      this.enter(entered);
+      this.recall(entered);
       this.suggest();
       this.others.hidden = !fields.some(({ more }) => more);
       this.more.replaceChildren(...this.fields.filter(({ more }) => more).flatMap(({ elements }) => elements));
@@ -67,11 +96,13 @@ class Field {
     const described = { id, "aria-describedby": help.id };
     const choices = field.choices.length ? field.choices : known.map(({ value, text }) => [value, text]);
     const closed = choices.length && !field.open && field.names !== "robot";
+    this.lists = (entered) => [entered].flat().every((each) => choices.some(([value]) => value === each));
     if (field.several && !choices.length && !field.names) {
       const input = h("input", { type: "text", placeholder: "several, with commas between them", ...described });
       this.elements = [h("label", { for: id }, field.label), h("div", {}, input, help)];
       this.value = () => input.value.split(",").map((text) => text.trim()).filter(Boolean);
       this.enter = (entered) => { input.value = [entered].flat().join(", "); };
+      this.initial = this.value();
       return;
     }
     if (field.several) {
@@ -87,6 +118,7 @@ class Field {
       this.elements = [h("span", { class: "label" }, field.label), h("div", {}, group, help)];
       this.value = () => [...group.querySelectorAll("input:checked")].map(({ value }) => value);
       this.enter = (entered) => { for (const box of group.querySelectorAll("input")) box.checked = [entered].flat().includes(box.value); };
+      this.initial = this.value();
       return;
     }
     const label = h("label", { for: id }, field.label);
@@ -114,8 +146,11 @@ class Field {
       this.value = () => (number && input.value !== "" ? Number(input.value) : input.value);
       this.enter = (entered) => { input.value = entered; };
     }
+    this.initial = this.value();
   }
 }
+
+const same = (one, other) => JSON.stringify(one) === JSON.stringify(other);
 
 function sentence({ label, help, required }) {
   if (help.toLowerCase() === label.toLowerCase()) return "";

@@ -15,7 +15,7 @@ export class View {
   }
 
   mount(element) {
-    this.form = new Form("Start the session", (values) => this.start(values));
+    this.form = new Form("Start the session", "record", (values) => this.start(values));
     this.disk = h("p", { class: "note", "aria-live": "polite" });
     this.chooser.fields.classList.add("form");
     this.form.element.prepend(this.chooser.fields);
@@ -39,7 +39,7 @@ export class View {
   // The dataset of the robot's YAML, unless one was entered.
   suggest() {
     const { dataset } = this.chooser.found ?? {};
-    if (dataset && !this.form.values.dataset) this.form.enter({ dataset });
+    if (dataset) this.form.propose("dataset", dataset);
   }
 
   enable() { this.form.button.disabled = !this.chooser.ready || !this.ui.drives || Boolean(this.missing) || this.ui.startsRun; }
