@@ -98,7 +98,7 @@ class AsideStream(io.TextIOBase):
     def _mention_dropped(self) -> None:
         if self.dropped:
             dropped, self.dropped = self.dropped, 0
-            self._put(f"({dropped} messages dropped: nothing read this output)\n".encode(self.encoding, "replace"))
+            self._put(f"(nothing read this output; messages dropped: {dropped})\n".encode(self.encoding, "replace"))
 
     def _write_all(self) -> None:
         try:

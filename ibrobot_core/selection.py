@@ -226,7 +226,7 @@ def _joint_reader(field: str, joints: list[str]) -> _Read:
     def values(message: Any) -> NDArray[np.generic]:
         array: NDArray[np.generic] = read(message)
         if len(array) != len(message.name):
-            raise ContractError(f"the message has {len(array)} values in {field} for {len(message.name)} joints")
+            raise ContractError(f"the message has {len(message.name)} names of joints, but {len(array)} in {field}")
         return array[indices(message.name)]
 
     return values

@@ -55,7 +55,7 @@ def test_writing_to_a_full_pipe_does_not_wait_and_what_is_dropped_is_counted(pip
         read += reader.read(FULL)
 
     assert aside.end(PATIENCE_S)
-    assert read.endswith(b"(1 messages dropped: nothing read this output)\n")
+    assert read.endswith(b"(nothing read this output; messages dropped: 1)\n")
 
 
 def test_a_reader_that_is_gone_is_an_error_for_the_next_writer(pipe):

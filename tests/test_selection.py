@@ -134,8 +134,8 @@ def test_paths_that_lead_nowhere_are_refused_at_once(type_name: str, select: lis
     ("received", "select", "message"),
     [
         (JointState(Header(), ("a", "b"), [1, 2]), ["position.c"], "no joint 'c'; it has: a, b"),
-        (JointState(Header(), ("a", "b"), [1, 2]), ["velocity.a"], "has 0 values in velocity for 2 joints"),
-        (JointState(Header(), ("a", "b"), [1, 2, 3]), ["position.a"], "has 3 values in position for 2 joints"),
+        (JointState(Header(), ("a", "b"), [1, 2]), ["velocity.a"], "has 2 names of joints, but 0 in velocity"),
+        (JointState(Header(), ("a", "b"), [1, 2, 3]), ["position.a"], "has 2 names of joints, but 3 in position"),
         (Float64MultiArray([1.0, 2.0]), ["data.2"], "has 2 elements in data, element 2 is asked for"),
     ],
 )

@@ -65,8 +65,8 @@ class CheckConfig(ShowConfig):
         if self.as_json:
             echo("[]")
             return
-        body = "simulation" if robot.simulated else "hardware"
-        echo(f"{robot.source}: ok ({robot.robot.name}, {len(robot.robot.joints)} joints, {body})")
+        body, count = "simulation" if robot.simulated else "hardware", len(robot.robot.joints)
+        echo(f"{robot.source}: ok ({robot.robot.name}, {count} joint{'' if count == 1 else 's'}, {body})")
         echo(f"joints brake from full speed within {robot.robot.braking_s.max() * 1e3:.0f} ms")
         echo(f"modes: {', '.join(robot.control_modes)}; starts in {robot.default_control_mode}")
         notes = [*notes_of(robot, registry), *(f"{problem.path}: {problem.message}" for problem in uncalibrated)]

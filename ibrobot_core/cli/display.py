@@ -97,7 +97,7 @@ class RunDisplay(ABC):
             return None
         stats = acting.engine
         state = f"answers in {stats.infer_ms:.0f} ms" if stats.alive else "IS GONE"
-        return f"{state} ({stats.mode}, {stats.failures} failures, {stats.restarts} restarts)"
+        return f"{state} ({stats.mode}, failures {stats.failures}, restarts {stats.restarts})"
 
     def commander_text(self) -> str:
         """Who commands the robot, if policy and operator take turns; otherwise empty."""

@@ -275,7 +275,7 @@ def _print_summary(runtime: Runtime, hooks: RunHooks, as_json: bool) -> None:
         more = f", {unjudged} not judged" if unjudged else ""
         echo(f"episodes   {judged + unjudged}, of which {summary['successes']} succeeded{more}")
         if summary["disturbed"]:
-            echo(f"disturbed  {summary['disturbed']} episodes, by a fault or an emergency stop")
+            echo(f"disturbed  {summary['disturbed']} of them, by a fault or an emergency stop")
     if summary["lockstep"]:
         echo(f"loop       {loop['ticks']} ticks in lockstep")
     elif loop["ticks"]:

@@ -96,7 +96,7 @@ class Checks:
 
     def _pose(self, key: Key, robot: Robot, positions: tuple[float, ...]) -> None:
         if len(positions) != len(robot.joints):
-            self.document.add(key, f"expected {len(robot.joints)} positions, one for each joint, got {len(positions)}")
+            self.document.add(key, f"expected a position for each joint, {len(robot.joints)}, got {len(positions)}")
             return
         for i, (joint, position) in enumerate(zip(robot.joints, positions, strict=True)):
             if not joint.lower <= position <= joint.upper:

@@ -259,7 +259,7 @@ class ContractChecks:
         size, joints = self._size(key, spec.type, spec.select), self._joints(spec)
         if size is not None and joints and size != len(joints):
             given = "a length that only messages determine" if size < 0 else f"{size} numbers"
-            message = f"gives {given} for the {len(joints)} joints of {spec.executor!r}: {', '.join(joints)}"
+            message = f"gives {given}, but {spec.executor!r} commands {len(joints)}: {', '.join(joints)}"
             self.document.add(key, message)
 
     def _joints(self, spec: ActionSpec) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ class SimulatedEpisodes(SessionWorker):
 
     def __init__(self, session: Session, needs: tuple[str, ...]) -> None:
         wanted = session.request.episodes
-        summary = f"{wanted if wanted is not None else 'endless'} episodes from seed {session.request.seed}"
+        summary = f"{'endless' if wanted is None else wanted}, from seed {session.request.seed}"
         super().__init__(session, "episodes", summary, needs)
         self._wanted = wanted
         self._longest_ns = ns(session.config.contract.max_duration_s)

@@ -165,7 +165,7 @@ CASES = {
             "executor: grip_position, topic: /grip, type: std_msgs/msg/Float64MultiArray, foreign: true, "
             "select: [data.0, data.1]"
         ),
-        ("robot.yaml:39: contract.actions.1.select: gives 2 numbers for the 1 joints of 'grip_position': grip"),
+        ("robot.yaml:39: contract.actions.1.select: gives 2 numbers, but 'grip_position' commands 1: grip"),
     ),
     "contract_action_joint_twice": (
         "gripper: [grip]",

@@ -81,7 +81,7 @@ CASES = {
     "pose_length": (
         "home: [0, 0, 0]",
         "home: [0, 0]",
-        "robot.yaml:11: robot.description.poses.home: expected 3 positions, one for each joint, got 2",
+        "robot.yaml:11: robot.description.poses.home: expected a position for each joint, 3, got 2",
     ),
     "pose_above": (
         "home: [0, 0, 0]",

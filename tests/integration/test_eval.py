@@ -333,7 +333,7 @@ def test_folder_of_other_settings_is_refused(folder: Path, whole: Path, tmp_path
         (("--margin", 0.2), "margin 0.1, now 0.2"),
         (("--set", "control.rate_hz=50"), "policies scripted robot YAML changed"),
         (("--mode", "again"), "policies again is new"),
-        (("--episodes", 1), "--episodes must not be smaller"),
+        (("--episodes", 1), "--episodes must not be less"),
     ):
         done = evaluate(folder, "--out", whole, *more)
         assert (done.returncode, said in done.stderr) == (2, True), done.stderr

@@ -124,7 +124,7 @@ def check(how: str, code: int, report: Any, text: str) -> None:
 def test_an_evaluation_of_errors_alone_ends(site: Site, how: str) -> None:
     code, report, text = evaluate(how, episodes=40)
     assert code == 1
-    assert "episodes so far ended in an error, so this is no evaluation: " in text
+    assert "so far, all ended in an error, so this is no evaluation: " in text
     assert ERRORS[how] in text
     assert 1 <= len(report["episodes"]) <= 12, "it ends early, with a report"
     assert not any(each["success"] for each in report["episodes"])

@@ -62,13 +62,13 @@ VALUES: dict[str, tuple[Any, ...]] = {
     "int | None": (None, 3), "float | None": (None, 2.5, 90.0),
 }  # fmt: skip
 LINES = {
-    "All 4 episodes are like one another: nothing was found.": "没有发现问题",
+    "Nothing was found in 4 episodes.": "没有发现问题",
     "a  2 of 4 succeeded, 95 % interval 7 to 93 %, median 3.1 s; a is better than b; "
     "b  0 of 4 succeeded, 95 % interval 0 to 60 %": "a 优于 b; b",
     "pick/a: Nothing is wrong with the set-up; more or better data is what helps: X": "设置没有问题",
     "1 of 2 episodes; pick/a: Nobody judged this episode.": "1 / 2 个回合; pick/a: 没有人评判过这个回合",
     "so101: 1 fail, 0 warn, 2 uncertain, 9 ok; there is no reference to compare with.": "没有可比较的参考",
-    "Nobody judged this episode.\nAll 4 episodes are like one another: nothing was found.": "没有人评判过这个回合",
+    "Nobody judged this episode.\nNothing was found in 4 episodes.": "没有人评判过这个回合",
 }
 """Lines that commands make of what they found -> a part of what the card says."""
 

@@ -212,7 +212,7 @@ class TestFullDisk:
         assert (done.code, done.out) == (1, "")
         assert done.err.count(FULL) == 1, "not once for each episode"
         assert "stopped at episode_" in done.err
-        kept = [int(text) for text in re.findall(r"(\d) of 4 episodes are converted and kept in", done.err)]
+        kept = [int(text) for text in re.findall(r"(\d) of 4 episodes converted and kept in", done.err)]
         assert kept[0] >= 1
         assert f"{disk}/set/.staging: make room, and run the same command again" in done.err
         assert list((disk / "set").rglob("*.making")) == []
@@ -232,7 +232,7 @@ class TestFullDisk:
         done = run("convert", dataset, "--to", "bag", "--out", disk / "back", "--set", "min_free=0")
         assert done.code == 1
         assert f"stopped at set:0: {FULL}" in done.err
-        assert f"0 of 2 episodes are converted and kept in {disk}/back: make room, and run the same command" in done.err
+        assert f"0 of 2 episodes converted and kept in {disk}/back: make room, and run the same command" in done.err
         assert done.err.count(FULL) == 1
         assert list(disk.rglob("*.mcap")) == []
         done = run("convert", dataset, "--to", "bag", "--out", disk / "back")

@@ -70,7 +70,7 @@ def test_the_plan_in_words(runs: Runs):
         "4. sensor:side  camera drawn  (needs control)",
         "5. mode:policy  net through the dispatcher at 25 Hz  (needs control, sensor:top, sensor:side, model:net)",
         "6. status       /robot_status and /diagnostics  (needs control)",
-        "7. episodes     2 episodes from seed 5  (needs mode:policy)",
+        "7. episodes     2, from seed 5  (needs mode:policy)",
         "stops in reverse order",
     ]
     assert runs.parts.MADE == {}, "a plan makes nothing"

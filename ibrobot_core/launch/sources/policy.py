@@ -147,7 +147,7 @@ class PolicySource(SourceWorker):
     @override
     def summary_rows(self) -> list[tuple[str, str]]:
         count = self._stats.unreachable
-        return [("unreachable", f"{count} actions, for which the robot held the one before")] if count else []
+        return [("unreachable", f"actions: {count}, for which the robot held the one before")] if count else []
 
     @override
     def facts(self) -> dict[str, Any]:

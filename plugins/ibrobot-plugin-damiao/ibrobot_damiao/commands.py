@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
 import attrs
+from ibrobot_terminal.plural import counted
 from ibrobot_terminal.questions import Declined, confirm
 
 from ibrobot_core.api import HardwareError, option
@@ -84,7 +85,9 @@ class Scan(OnChannel):
         for row in rows:
             echo(row)
         if unusable:
-            raise HardwareError(f"{self.channel}: {unusable} of {len(rows)} motors cannot be used, as listed")
+            raise HardwareError(
+                f"{self.channel}: {unusable} of {counted(len(rows), 'motor')} cannot be used, see above"
+            )
 
 
 @attrs.frozen(kw_only=True)

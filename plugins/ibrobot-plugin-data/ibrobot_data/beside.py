@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.app import Channel, Child, ComponentFailed, read_options, run_child
 from ibrobot_data.command import Convert, conversion_request
 from ibrobot_data.episode_service import EpisodeService
-from ibrobot_data.plural import plural
 from ibrobot_data.run import follow, stage
 from ibrobot_data.written import WrittenEpisode
 
@@ -114,7 +114,7 @@ class ConversionBeside:
         """What is done, for the panel."""
         done = sum(not why for why in self._done.values())
         now = "" if self._child is None else f"; {self._episode.name} {'waits' if self._paused else 'follows'}"
-        return f"{done} {plural(done, 'episode')} converted for {self._options.out}{now}"
+        return f"{counted(done, 'episode')} converted for {self._options.out}{now}"
 
     def _start(self, episode: Path, *, growing: bool = False) -> None:
         options = attrs.evolve(self._options, episodes=(episode,))

@@ -16,6 +16,7 @@ import attrs
 from ibrobot_provenance.datasets import DatasetDescriptor
 from ibrobot_provenance.jobs import check_pool
 from ibrobot_provenance.work_options import shard_of
+from ibrobot_terminal.plural import counted, plural
 
 from ibrobot_core.api import Contract, DatasetError, option
 from ibrobot_core.app import (
@@ -35,7 +36,6 @@ from ibrobot_core.app import (
 )
 from ibrobot_data import conversion
 from ibrobot_data.conversion import ConvertOptions
-from ibrobot_data.plural import plural
 from ibrobot_data.prompt import check_prompt
 from ibrobot_data.request import ConversionRequest, EpisodeReport, Report
 from ibrobot_data.stated import listed_joints, names_of, names_option
@@ -285,7 +285,7 @@ def _progress(episodes: int, quiet: bool) -> Iterator[Any]:
             nonlocal done
             if report is not None and not quiet:
                 done += 1
-                what = report.error.splitlines()[0] if report.error else f"{report.frames} frames"
+                what = report.error.splitlines()[0] if report.error else f"{counted(report.frames, 'frame')}"
                 echo(f"{report.source}: {what} ({done} of {episodes}, {rate(frames)})", err=True)
 
         yield line
@@ -295,7 +295,7 @@ def _progress(episodes: int, quiet: bool) -> Iterator[Any]:
 
     counts, speed = (TextColumn(each, markup=False) for each in ("{task.description}", "{task.fields[rate]}"))
     with Progress(counts, BarColumn(), speed, TimeRemainingColumn(), console=Screen(stderr=True)) as bar:
-        task = bar.add_task(f"0 of {episodes} episodes", total=None, rate="")
+        task = bar.add_task(f"0 of {counted(episodes, 'episode')}", total=None, rate="")
 
         def move(frames: int, total: int, report: EpisodeReport | None) -> None:
             nonlocal done
@@ -306,7 +306,7 @@ def _progress(episodes: int, quiet: bool) -> Iterator[Any]:
                     bar.console.print(styled(report.source, "red") + styled(f": left out: {why}"))
             bar.update(
                 task,
-                description=f"{done} of {episodes} episodes",
+                description=f"{done} of {counted(episodes, 'episode')}",
                 completed=frames,
                 total=max(total, frames),
                 rate=rate(frames),
@@ -326,13 +326,13 @@ def _print_report(report: Report) -> None:
     done = report.converted
     for each in done:
         if not each.finished:
-            echo(f"unfinished {each.source}: it has the {each.frames} frames that could be read", err=True)
+            echo(f"unfinished {each.source}: it has the {counted(each.frames, 'frame')} that could be read", err=True)
     if not done:
         echo(f"nothing was added to {report.out}")
         return
     resumed = f", {report.resumed} of them by an earlier run" if report.resumed else ""
     made = summary["episodes"]
-    source = f" from {len(done)} {plural(len(done), 'recording')}" if made != len(done) else ""
+    source = f" from {counted(len(done), 'recording')}" if made != len(done) else ""
     episodes, frames = plural(made, "episode"), plural(summary["frames"], "frame")
     echo(f"{made} {episodes}{source}, {summary['frames']} {frames}{resumed} -> {report.out}")
     echo(

@@ -7,10 +7,10 @@ from typing import override
 
 import attrs
 from ibrobot_provenance.work_options import on_option, shard_option
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import option
 from ibrobot_core.app import NORM_MODES, Event, Shown
-from ibrobot_data.plural import plural
 
 OUTCOMES = {"success": "successful", "failure": "failed", "unknown": "not judged"}
 MISSING = {"refuse": "leave the episode out", "skip": "leave the tick out", "hold": "repeat the last value"}
@@ -111,7 +111,7 @@ class Begin(Event):
 
     @override
     def shown(self) -> Shown:
-        return Shown(f"0 of {self.of} {plural(self.of, 'episode')}", 0.0)
+        return Shown(f"0 of {counted(self.of, 'episode')}", 0.0)
 
 
 @attrs.frozen(kw_only=True)
@@ -128,7 +128,7 @@ class Progress(Event):
 
     @override
     def shown(self) -> Shown:
-        text = f"{self.done} of {self.of} {plural(self.of, 'episode')}, {self.frames} frames, {self.seconds:.0f} s"
+        text = f"{self.done} of {counted(self.of, 'episode')}, {counted(self.frames, 'frame')}, {self.seconds:.0f} s"
         problem = f"{self.episode} is left out: {self.error}" if self.error else ""
         return Shown(text, min(1.0, self.frames / max(1, self.total_frames)), problem)
 
@@ -163,7 +163,7 @@ class Report(Event):
             "without a task": self.without_prompt,
         }
         others = "".join(f", {name} {count}" for name, count in counts.items() if count)
-        text = f"{self.episodes} {plural(self.episodes, 'episode')}, {self.frames} frames{others}"
+        text = f"{counted(self.episodes, 'episode')}, {counted(self.frames, 'frame')}{others}"
         made = {"dataset": self.out} if self.episodes else {}
         return Shown(f"{text}; the dataset has {self.size_bytes / 1e6:.1f} MB", 1.0, made=made)
 

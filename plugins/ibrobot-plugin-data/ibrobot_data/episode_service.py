@@ -11,6 +11,7 @@ from types import NoneType
 from typing import TYPE_CHECKING, Any, Literal, get_args, override
 
 import attrs
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import NS_PER_S, Contract, NotSupported, RecorderError, documented, option, seconds
 from ibrobot_core.app import Episodes, NoRequest, RecordedRun, Service, wrong_input
@@ -318,7 +319,7 @@ class EpisodeService(Episodes):
         """How the present episode goes on."""
         left_s = self._session.config.contract.max_duration_s - self.elapsed_s() if self.running else 0.0
         lost = sum(self._recording.lost().values())
-        return RecordProgress(max(0, int(left_s)), f"episode {self.number}, {lost} messages lost")
+        return RecordProgress(max(0, int(left_s)), f"episode {self.number}, {counted(lost, 'message')} lost")
 
     def redo(self) -> None:
         """Record the present episode again, or else the last one of this run, which is deleted once that is saved.

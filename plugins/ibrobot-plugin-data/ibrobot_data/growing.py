@@ -9,6 +9,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import override
 
+from ibrobot_terminal.plural import counted
+
 from ibrobot_core.api import EpisodeReader, EpisodeSummary, Recorded, RecorderError
 from ibrobot_core.app import installed_plugins
 
@@ -54,7 +56,9 @@ class GrowingEpisode(EpisodeReader):
             yield item
         for topic, each in self.summary().topics.items():
             if (topics is None or topic in topics) and read[topic] != each.count:
-                raise RecorderError(f"{self._path}: of {topic}, {each.count} messages came, {read[topic]} in order")
+                raise RecorderError(
+                    f"{self._path}: of {topic}, {counted(each.count, 'message')} came, {read[topic]} in order"
+                )
 
     @override
     def messages_since(self, stamp_ns: int, topics: Collection[str] | None = None) -> Iterator[Recorded]:

@@ -6,13 +6,14 @@ from collections.abc import Callable
 from math import inf
 from typing import TYPE_CHECKING, override
 
+from ibrobot_terminal.plural import counted, plural
+
 from ibrobot_core.api import IbrobotError, NotSupported, OperatorEvent, ViewerDescriptor, seconds
 from ibrobot_core.app import Event, RecordedRun, RunHooks
 from ibrobot_data.cues import ENDING_S, Cues
 from ibrobot_data.episode_service import RECORD, START, EpisodeService
 from ibrobot_data.errors import DiskFull
 from ibrobot_data.options import has_button
-from ibrobot_data.plural import plural
 from ibrobot_data.recording_session import Session as SessionEvent
 from ibrobot_data.written import lost_text, rows
 
@@ -218,7 +219,7 @@ class Operator(RunHooks):
     def line(self) -> str:
         """One line, where there is no panel."""
         lost = sum(self._service.status().lost.values())
-        return f"{self._state()}, saved {self._saved()}{f', lost {lost} messages' if lost else ''}"
+        return f"{self._state()}, saved {self._saved()}{f', lost {counted(lost, "message")}' if lost else ''}"
 
     @override
     def help(self) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import attrs
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import option
 from ibrobot_core.app import (
@@ -30,7 +31,6 @@ from ibrobot_data.cues import Cues
 from ibrobot_data.episode_dataset import EpisodeDataset, count_complete
 from ibrobot_data.episode_service import EpisodeService
 from ibrobot_data.operator import Operator
-from ibrobot_data.plural import plural
 from ibrobot_data.prompt import check_prompt
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ class Record(ModeOptions):
             prompt = prompt or EpisodeDataset(folder).prompt or None
         conversion = self._conversion(folder)
         if self.episodes is not None and earlier >= self.episodes:
-            echo(f"{folder}: has {earlier} {plural(earlier, 'episode')} already")
+            echo(f"{folder}: has {counted(earlier, 'episode')} already")
             if conversion is not None:
                 conversion(emit)
             return

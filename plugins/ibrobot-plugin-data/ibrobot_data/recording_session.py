@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any, override
 
 import attrs
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import option
 from ibrobot_core.app import Event, Shown
-from ibrobot_data.plural import plural
 
 
 @attrs.frozen(kw_only=True)
@@ -22,10 +22,10 @@ class Session(Event):
 
     @override
     def shown(self) -> Shown:
-        count = f"{self.saved} {plural(self.saved, 'episode')}"
+        count = f"{counted(self.saved, 'episode')}"
         progress = None
         if self.wanted is not None:
-            count = f"{self.saved} of {self.wanted} {plural(self.wanted, 'episode')}"
+            count = f"{self.saved} of {counted(self.wanted, 'episode')}"
             progress = min(1.0, self.saved / self.wanted)
         made: dict[str, Any] = {"episodes": self.folder} if self.saved else {}
         return Shown(f"{self.state} · {count} saved", progress, made=made)

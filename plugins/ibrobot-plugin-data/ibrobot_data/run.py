@@ -18,6 +18,7 @@ from ibrobot_provenance.datasets import DatasetSummary
 from ibrobot_provenance.jobs import Job as PoolJob
 from ibrobot_provenance.jobs import Pool, open_pool
 from ibrobot_provenance.ownership import Ownership
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import Contract, DatasetError, EpisodeAddress, IbrobotError, RecorderError, seconds
 from ibrobot_core.app import installed_plugins, set_malloc
@@ -419,7 +420,7 @@ class _Plan:
             _remove_unfinished(self._staging)
             kept = len(self.units())
             raise DiskFull(
-                f"stopped at {error}; {kept} of {len(self._jobs)} episodes are converted and kept in "
+                f"stopped at {error}; {kept} of {counted(len(self._jobs), 'episode')} converted and kept in "
                 f"{self.request.out / STAGING}: make room, and run the same command again"
             ) from None
 

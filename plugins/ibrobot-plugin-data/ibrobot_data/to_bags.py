@@ -14,6 +14,7 @@ from typing import Any
 import attrs
 from ibrobot_provenance.datasets import with_pinholes
 from ibrobot_provenance.ownership import Ownership
+from ibrobot_terminal.plural import counted
 
 import ibrobot_core
 from ibrobot_core.api import (
@@ -98,8 +99,9 @@ def _convert_all(request: BagRequest, watch: Watch) -> list[EpisodeReport]:
             report = job.run(progress)
         except DiskFull as error:
             raise DiskFull(
-                f"stopped at {error}; {len([each for each in reports if not each.error])} of {len(request.numbers)} "
-                f"episodes are converted and kept in {request.out}: make room, and run the same command again"
+                f"stopped at {error}; {len([each for each in reports if not each.error])} of "
+                f"{counted(len(request.numbers), 'episode')} converted and kept in {request.out}: make room, and "
+                "run the same command again"
             ) from None
         done += report.frames
         watch(done, done, report)

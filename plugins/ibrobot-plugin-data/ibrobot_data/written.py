@@ -8,10 +8,10 @@ from contextlib import closing
 from pathlib import Path
 
 import attrs
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import EpisodeSummary, IbrobotError, seconds
 from ibrobot_core.app import RunView, error_text
-from ibrobot_data.plural import plural
 
 
 @attrs.frozen
@@ -74,14 +74,14 @@ def read_back(run: RunView, path: Path, stated: str, told: str, lost: Mapping[st
 
 def _size(summary: EpisodeSummary) -> str:
     count = sum(each.count for each in summary.topics.values())
-    return f"{seconds(summary.end_ns - summary.start_ns):.1f} s, {count} {plural(count, 'message')}"
+    return f"{seconds(summary.end_ns - summary.start_ns):.1f} s, {counted(count, 'message')}"
 
 
 def lost_text(lost: Mapping[str, int]) -> str:
     """The number of lost messages, by topic, most first."""
     count = sum(lost.values())
     each = ", ".join(f"{topic} {number}" for topic, number in Counter(lost).most_common())
-    return f"{count} {plural(count, 'message')} lost ({each})"
+    return f"{counted(count, 'message')} lost ({each})"
 
 
 def rows(episodes: Sequence[WrittenEpisode]) -> list[tuple[str, str]]:
@@ -89,7 +89,7 @@ def rows(episodes: Sequence[WrittenEpisode]) -> list[tuple[str, str]]:
     faults = [("unfinished", str(each.path)) for each in episodes if not each.whole]
     if lost := _sum(each.lost for each in episodes):
         count = sum(bool(each.lost) for each in episodes)
-        faults.append(("lost", f"{lost_text(lost)}, in {count} of {len(episodes)} {plural(len(episodes), 'episode')}"))
+        faults.append(("lost", f"{lost_text(lost)}, in {count} of {counted(len(episodes), 'episode')}"))
     if unknown := [each for each in episodes if each.unknown]:
         each = ", ".join(f"{each.path.name} (was {each.stated})" for each in unknown)
         faults.append(("unknown", f"the end was lost of {each}; `ibrobot episodes mark` sets the outcome"))

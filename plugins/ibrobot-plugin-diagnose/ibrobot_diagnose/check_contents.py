@@ -11,6 +11,7 @@ from ibrobot_provenance.files import replace_file
 from ibrobot_provenance.report_page import as_page
 from ibrobot_provenance.reports import Case, Cases, Fix, ReportSection, Table, Text
 from ibrobot_provenance.svg import tag
+from ibrobot_terminal.plural import counted
 
 from ibrobot_diagnose.contents import figures, read_facts, read_sections
 from ibrobot_diagnose.options import CHECK
@@ -55,7 +56,7 @@ def contents_of(facts: Mapping[str, Any]) -> list[ReportSection]:
     if cases:
         blocks.append(Text("The worst come first. What a click does can be undone.", "note"))
         blocks.append(Cases(cases))
-    sections = [ReportSection(f"{facts['dataset']}: {facts['episodes']} episodes", tuple(blocks))]
+    sections = [ReportSection(f"{facts['dataset']}: {counted(facts['episodes'], 'episode')}", tuple(blocks))]
     if facts["counts"]:
         rows = tuple((name, str(count)) for name, count in facts["counts"].items())
         sections.append(ReportSection("What was found", (Table(("cause", "episodes"), rows),)))

@@ -7,6 +7,7 @@ from typing import override
 
 import attrs
 from ibrobot_provenance.work_options import on_option
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import Options, documented, option
 from ibrobot_core.app import Event, Shown
@@ -121,7 +122,7 @@ class CheckProgress(Event):
 
     @override
     def shown(self) -> Shown:
-        return Shown(f"{self.done} of {self.of} steps", self.done / max(1, self.of))
+        return Shown(f"{self.done} of {counted(self.of, 'step')}", self.done / max(1, self.of))
 
 
 @attrs.frozen(kw_only=True)

@@ -8,6 +8,7 @@ from typing import Any
 
 import attrs
 import numpy as np
+from ibrobot_terminal.plural import counted
 
 from ibrobot_diagnose.cause import Diagnosis, Finding, Reference
 from ibrobot_diagnose.course import Course, course_of
@@ -191,7 +192,7 @@ def between_lines(window: Window, course: Course | None) -> list[str]:
     if not facts["used"]:
         return ["No answer of a model was used in this recording."] if window.asked else []
     lines = [
-        f"Between answer and arm: {facts['requests']} requests, {facts['used']} used, {facts['late']} late, "
+        f"Between answer and arm: {counted(facts['requests'], 'request')}, {facts['used']} used, {facts['late']} late, "
         f"{facts['failed']} failed; {facts['latency_ms']:.0f} ms for an answer, {facts['past_actions']:.1f} of "
         f"{facts['chunk_actions']:.0f} actions past when it came."
     ]

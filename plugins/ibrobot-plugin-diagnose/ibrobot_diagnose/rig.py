@@ -10,6 +10,7 @@ from typing import Any
 
 import attrs
 import numpy as np
+from ibrobot_terminal.plural import counted
 from numpy.typing import NDArray
 
 from ibrobot_diagnose.pictures import png, read_png
@@ -157,7 +158,7 @@ def _camera_of(facts: Mapping[str, Any], joints: int) -> RigCamera:
     for each in facts["stills"]:
         pose = np.array([math.nan if value is None else _finite(value, "pose") for value in each["pose"]])
         if pose.shape != (joints,):
-            raise ValueError(f"the pose of a still has {pose.size} joints, must have {joints}")
+            raise ValueError(f"the pose of a still has {counted(pose.size, 'joint')}, must have {joints}")
         if np.abs(pose[np.isfinite(pose)]).max(initial=0.0) > _FARTHEST:
             raise ValueError(f"the pose of a still is beyond {_FARTHEST:g} rad")
         stills.append(Still(read_png(base64.b64decode(each["picture"], validate=True)), pose))

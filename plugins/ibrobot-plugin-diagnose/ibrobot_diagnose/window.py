@@ -13,6 +13,7 @@ from typing import Any
 import attrs
 import numpy as np
 from ibrobot_provenance.recorded_names import COMMANDER, GUARD
+from ibrobot_terminal.plural import counted
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
@@ -498,9 +499,9 @@ def _asked_of(message: ModelAnswer, path: Path) -> Asked:
     """
     size, what = len(message.joint_names), f"{path}: answer {message.request} of the model"
     if message.actions.size % max(1, size):
-        raise RecorderError(f"{what} has {message.actions.size} numbers for {size} joints")
+        raise RecorderError(f"{what} has {message.actions.size} numbers for {counted(size, 'joint')}")
     if message.actions.size and (message.step_ns <= 0 or not size):
-        raise RecorderError(f"{what} has actions for {size} joints, {message.step_ns} ns apart")
+        raise RecorderError(f"{what} has actions for {counted(size, 'joint')}, {message.step_ns} ns apart")
     if not 0 <= message.latency_ms <= _FARTHEST:
         raise RecorderError(f"{what} took {message.latency_ms} ms")
     chunk = message.actions.reshape(-1, size) if size else np.empty((0, 0))

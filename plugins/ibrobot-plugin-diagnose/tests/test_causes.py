@@ -663,7 +663,7 @@ def test_check_of_a_dataset_names_a_cause_with_a_mistake(monkeypatch, data):
     untested = [{"name": name, "why": why, "episodes": 1}]
     lines = check.lines_of({"episodes": 2, "listed": [], "counts": {}, "unreadable": [], "untested": untested})
     assert lines[0].startswith("Not tested in 1 of 2 episodes: squeaks, since ibrobot-plugin-squeaks has a mistake: ")
-    assert lines[-1] == "All 2 episodes are like one another: nothing was found."
+    assert lines[-1] == "Nothing was found in 2 episodes."
 
 
 def test_consequence_of_the_first_cause_says_to_fix_that_first(data):

@@ -80,7 +80,7 @@ def test_unreadable_episode_is_named_and_the_others_are_explained(folder, tmp_pa
 @pytest.mark.parametrize(
     ("damaged", "says"),
     [
-        (1, "All 2 episodes are like one another: nothing was found; 1 of 3 episodes could not be read."),
+        (1, "Nothing was found in 2 episodes; 1 of 3 episodes could not be read."),
         (3, "Nothing was checked: 3 of 3 episodes could not be read."),
     ],
 )

@@ -19,6 +19,7 @@ from typing import override
 import attrs
 import numpy as np
 from ibrobot_provenance.asking import Choice
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import IbrobotError, seconds
 from ibrobot_core.app import LaunchRequest, LogFormatter, Runtime, Session, end_signals, error_text, installed_plugins
@@ -78,7 +79,7 @@ def power(trials: int, policies: int) -> list[str]:
     return [
         f"trials of each policy that detect a difference between the success rates of {of} policies with a probability "
         f"of {100 * POWER:g} %: {', '.join(needed)}",
-        f"probability with {trials} trials of each policy: {', '.join(chances)}",
+        f"probability with {counted(trials, 'trial')} of each policy: {', '.join(chances)}",
         "these numbers are for rates around 50 %, e.g. 55 and 45 %; near 0 and 100 % fewer trials are enough",
     ]
 

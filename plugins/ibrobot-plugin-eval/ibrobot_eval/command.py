@@ -10,6 +10,7 @@ from contextlib import contextmanager
 
 import attrs
 from ibrobot_provenance.jobs import check_pool
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import option
 from ibrobot_core.app import (
@@ -129,7 +130,7 @@ def _evaluated(evaluation: Evaluation, emit: Emit, *, quiet: bool) -> Report:
 
     def filming(failures: int) -> None:
         if emit is None and not quiet:
-            echo(f"filming {failures} failures", err=True)
+            echo(f"filming {counted(failures, 'failure')}", err=True)
 
     options = evaluation.options
 
@@ -180,7 +181,7 @@ def _lines(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
     for damage in evaluation.damaged:
         echo(damage, err=True)
     if evaluation.resumed and not quiet:
-        echo(f"continuing: {evaluation.resumed} episodes are done already", err=True)
+        echo(f"continuing after {counted(evaluation.resumed, 'episode')}", err=True)
     if not sys.stderr.isatty():
 
         def line(done: int, total: int, policy: Policy, result: Result) -> None:
@@ -208,11 +209,15 @@ def _lines(evaluation: Evaluation, quiet: bool) -> Iterator[Watch]:
             count[1] += 1
             count[2] += result.is_error
             successes = ", ".join(
-                f"{label} {won} of {ran}{f' ({errors} errors)' if errors else ''}"
+                f"{label} {won} of {ran}{f' ({counted(errors, "error")})' if errors else ''}"
                 for label, (won, ran, errors) in counts.items()
             )
             bar.update(
-                task, description=f"{done} of {total} episodes", completed=done, total=total, successes=successes
+                task,
+                description=f"{done} of {counted(total, 'episode')}",
+                completed=done,
+                total=total,
+                successes=successes,
             )
 
         yield move

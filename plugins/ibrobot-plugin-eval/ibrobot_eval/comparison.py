@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import attrs
+from ibrobot_terminal.plural import counted
 
 from ibrobot_eval.episodes import Result
 from ibrobot_eval.statistics import (
@@ -96,7 +97,7 @@ class Comparison:
         if self.more_episodes is None:
             return f"undecided between {first} and {second}; more than 100,000 episodes would decide"
         about = _rounded(self.more_episodes)
-        return f"undecided between {first} and {second}; about {about} more episodes of each would decide"
+        return f"undecided between {first} and {second}; about {counted(about, 'more episode')} of each would decide"
 
 
 def _rounded(number: int) -> int:

@@ -14,6 +14,7 @@ from uuid import uuid4
 import attrs
 from ibrobot_provenance.code import differing_code, installed_code
 from ibrobot_provenance.files import replace_file
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import MODEL_ANSWERS, Contract, DatasetError, Message, ModelAnswer, RecorderError, seconds
 from ibrobot_core.app import (
@@ -181,7 +182,7 @@ def _errors(answers: Sequence[Message]) -> str:
     """What went wrong with requests to the policy; empty if nothing did."""
     asked = [each for each in answers if isinstance(each, ModelAnswer)]
     failed = [each.error for each in asked if each.error]
-    return f"{len(failed)} of {len(asked)} requests to the policy failed: {failed[0]}" if failed else ""
+    return f"{len(failed)} of {counted(len(asked), 'request')} to the policy failed: {failed[0]}" if failed else ""
 
 
 def code_here() -> dict[str, str]:

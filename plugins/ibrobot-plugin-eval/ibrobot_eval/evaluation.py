@@ -13,6 +13,7 @@ from typing import Any
 import attrs
 from ibrobot_provenance.jobs import Done, Job, open_pool
 from ibrobot_provenance.ownership import owned
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import DatasetError
 from ibrobot_core.app import ComponentFailed, installed_plugins
@@ -83,7 +84,8 @@ class Evaluation:
                 text = Counter(each.error for each in results).most_common(1)[0][0]
                 folder = Place.of(self.options.out, policy, 0).result.parent
                 return (
-                    f"{policy.label}: all {len(results)} episodes so far ended in an error, so this is no evaluation: "
+                    f"{policy.label}: {counted(len(results), 'episode')} so far, all ended in an error, so this is no "
+                    "evaluation: "
                     f"{text}; after a repair that changes no file, remove {folder} to try again"
                 )
         return ""
@@ -259,7 +261,9 @@ def _begin(options: EvalOptions, settings: Mapping[str, Any]) -> None:
             raise DatasetError(f"{out}: was begun with other settings: {'; '.join(differing)}; choose a new folder")
         done = max((len(list(each.glob("seed_*.json"))) for each in (out / "results").glob("*")), default=0)
         if done > len(options.seeds) and not options.until_decided:
-            raise DatasetError(f"{out}: already has {done} episodes of a policy; --episodes must not be smaller")
+            raise DatasetError(
+                f"{out}: already has {counted(done, 'episode')} of a policy; --episodes must not be less"
+            )
         return
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out}: exists and is not an evaluation; choose a new folder")

@@ -8,6 +8,7 @@ from typing import override
 import attrs
 from ibrobot_provenance.asking import Ask
 from ibrobot_provenance.work_options import on_option, shard_of, shard_option
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import option
 from ibrobot_core.app import Event, Shown
@@ -111,7 +112,7 @@ class Begin(Event):
 
     @override
     def shown(self) -> Shown:
-        return Shown(f"{self.done} of {self.of} episodes", self.done / self.of)
+        return Shown(f"{self.done} of {counted(self.of, 'episode')}", self.done / self.of)
 
 
 @attrs.frozen(kw_only=True)
@@ -130,7 +131,7 @@ class Progress(Event):
     @override
     def shown(self) -> Shown:
         outcome = outcome_of(self.success, self.error)
-        text = f"{self.done} of {self.of} episodes; {self.policy}, seed {self.seed}: {outcome}"
+        text = f"{self.done} of {counted(self.of, 'episode')}; {self.policy}, seed {self.seed}: {outcome}"
         return Shown(text, self.done / self.of)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_terminal.plural import counted
 
 from ibrobot_eval.comparison import Comparison, Summary, compare
 from ibrobot_eval.episodes import Place, Result, write
@@ -186,7 +187,7 @@ class Report:
                 f"{LEVEL} interval {percent(each.exact)}{time}"
             )
         errors = self.errors
-        more = [f"and {len(errors) - _MOST_LINES} other errors"] if len(errors) > _MOST_LINES else []
+        more = [f"and {counted(len(errors) - _MOST_LINES, 'other error')}"] if len(errors) > _MOST_LINES else []
         return [*lines, *(each.words for each in self.comparisons), *errors[:_MOST_LINES], *more, *self.notes]
 
 

@@ -80,7 +80,7 @@ def test_an_arm_with_right_directions_passes(arm: Line, tmp_path: Path) -> None:
     assert same
     assert not named(person)
     assert person.loose == [True] * 6, "the torque is off before a joint is to be turned"
-    assert person.said[-1] == "6 servos match the calibration"
+    assert person.said[-1] == "6 servos as in the calibration"
 
 
 @pytest.mark.parametrize("joint", JOINTS)

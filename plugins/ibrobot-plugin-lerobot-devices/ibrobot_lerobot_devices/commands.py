@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_terminal.plural import counted
 from ibrobot_terminal.questions import Declined, confirm
 
 from ibrobot_core.api import HardwareError, did_you_mean, option
@@ -78,7 +79,7 @@ class NewRobot:
             given[name if equals else OTHERS] = unit
         with wrong_input():
             written = write_robot(self.out, self.robot, self.id_ or self.robot, given)
-        echo(f"{self.out}: {written.type}, {len(written.mapped)} joints")
+        echo(f"{self.out}: {written.type}, {counted(len(written.mapped), 'joint')}")
         if not written.measured:
             name = self.id_ or self.robot
             echo(f"note: limits of joints are guesses, since LeRobot has no calibration {name}: check them")

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import attrs
+from ibrobot_terminal.plural import counted
 from ibrobot_terminal.screen import Screen
 from rich.table import Table
 
@@ -34,8 +35,9 @@ class ShowDataset:
         """Print a table of the features."""
         console = Screen(width=None if sys.stdout.isatty() else 1000)
         console.print(
-            f"{contents.path}: LeRobot {contents.version}, {contents.episodes} episodes, {contents.frames} frames at "
-            f"{contents.fps:g} Hz, {contents.seconds:.1f} s, {contents.bytes / 1e6:.1f} MB",
+            f"{contents.path}: LeRobot {contents.version}, {counted(contents.episodes, 'episode')}, "
+            f"{counted(contents.frames, 'frame')} at {contents.fps:g} Hz, {contents.seconds:.1f} s, "
+            f"{contents.bytes / 1e6:.1f} MB",
             soft_wrap=True,
         )
         for note in contents.notes:
@@ -71,7 +73,7 @@ class Merge:
         from ibrobot_lerobot.join import join_datasets
 
         episodes = join_datasets(self.parts, self.out)
-        echo(f"{episodes} episodes of {len(self.parts)} datasets -> {self.out}")
+        echo(f"{counted(episodes, 'episode')} of {len(self.parts)} datasets -> {self.out}")
 
 
 @attrs.frozen(kw_only=True)
@@ -112,7 +114,8 @@ class Pull:
         pull_dataset(self.repository, out, revision=self.revision)
         contents = dataset_contents(out)
         echo(
-            f"{self.repository} -> {out}: {contents.episodes} episodes, {contents.frames} frames at {contents.fps:g} Hz"
+            f"{self.repository} -> {out}: {counted(contents.episodes, 'episode')}, "
+            f"{counted(contents.frames, 'frame')} at {contents.fps:g} Hz"
         )
 
 

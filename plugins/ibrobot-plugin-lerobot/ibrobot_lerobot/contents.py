@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import override
 
 import attrs
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import option
 from ibrobot_core.app import Event, Shown
@@ -60,4 +61,4 @@ class Contents(Event):
 
     @override
     def shown(self) -> Shown:
-        return Shown(f"{self.path}: {self.episodes} episodes, {self.frames} frames")
+        return Shown(f"{self.path}: {counted(self.episodes, 'episode')}, {counted(self.frames, 'frame')}")

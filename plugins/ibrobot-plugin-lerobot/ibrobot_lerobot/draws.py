@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, override
 
 import torch
+from ibrobot_terminal.plural import counted
 from torch.overrides import TorchFunctionMode
 
 _OF_SIZE = frozenset({"randn", "rand"})
@@ -91,7 +92,7 @@ class Draws(TorchFunctionMode):  # type: ignore[misc]  # torch has no types here
         """Number of rows per request, out of `length`."""
         name, rows = self._alone[len(self.made)] if len(self.made) < len(self._alone) else ("", 0)
         if name != func.__name__ or rows == 0 or length != rows * len(self._states):
-            raise NotByRequest(f"{func.__name__} of {length} rows for {len(self._states)} requests")
+            raise NotByRequest(f"{func.__name__} of {length} rows for {counted(len(self._states), 'request')}")
         return rows
 
     def _drawn(self, i: int, func: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> torch.Tensor:

@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from ibrobot_terminal.plural import counted
+
 from ibrobot_core.api import DatasetError, MissingDependency, how_to_install
 from ibrobot_lerobot.read_contents import dataset_contents
 
@@ -70,7 +72,7 @@ def push(dataset: Path, repository: str, *, private: bool = False) -> str:
         old = [name for name in there if name.split("/")[0] in _KINDS and name not in files]
         operations += [hub.CommitOperationDelete(name) for name in old]
         done = api.create_commit(
-            repository, operations, repo_type="dataset", commit_message=f"{contents.episodes} episodes"
+            repository, operations, repo_type="dataset", commit_message=f"{counted(contents.episodes, 'episode')}"
         )
         version = json.loads((dataset / "meta" / "info.json").read_text(encoding="utf-8"))["codebase_version"]
         tags = [each.name for each in api.list_repo_refs(repository, repo_type="dataset").tags]

@@ -296,7 +296,7 @@ class _Merge:
                         table = _replaced(table, name, _numbers(table, name) + offset)
                     numbers = _numbers(table, "task_index")
                     if not all(0 <= number < len(tasks) for number in (numbers.min(initial=0), numbers.max(initial=0))):
-                        raise ValueError(f"task_index from {numbers.min()} to {numbers.max()}, of {len(tasks)} tasks")
+                        raise ValueError(f"task_index from {numbers.min()} to {numbers.max()}, of {len(tasks)} in all")
                     table = _replaced(table, "task_index", tasks[numbers])
                     for key, width in self._vectors().items():
                         _check_vectors(table.column(key), key, width)

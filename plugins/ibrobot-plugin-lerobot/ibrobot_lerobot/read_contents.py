@@ -116,7 +116,7 @@ def _notes(dataset: layout.OnDisk) -> tuple[str, ...]:
     for key in dataset.videos:
         wanted = {dataset.video(row, key) for row in rows}
         if missing := [path for path in sorted(wanted) if not is_content(path)]:
-            notes.append(f"{key}: {len(missing)} of {len(wanted)} videos are missing, e.g. {missing[0]}")
+            notes.append(f"{key}: missing {len(missing)} of {counted(len(wanted), 'video')}, e.g. {missing[0]}")
     if not dataset.is_current:
         notes.append(
             "an older version, which is read only; `ibrobot datasets merge DATASET --out NEW` copies it to v3.0"

@@ -16,6 +16,7 @@ import numpy as np
 from ibrobot_calibration.joint_units import JointUnits
 from ibrobot_provenance.datasets import with_pinholes
 from ibrobot_provenance.robot_metadata import robot_metadata
+from ibrobot_terminal.plural import counted
 from numpy.typing import NDArray
 
 from ibrobot_core.api import (
@@ -61,7 +62,7 @@ class LeRobotReader(EpisodeReader):
             assert dataset is not None
             total = dataset.info["total_episodes"]
             if address.number is None:
-                raise RecorderError(f"{root}: is a dataset of {total} episodes; choose one, e.g. {root}:0")
+                raise RecorderError(f"{root}: is a dataset of {counted(total, 'episode')}; choose one, e.g. {root}:0")
             self._rows = EpisodeRows(dataset, address.number)
         except DatasetError as error:
             raise RecorderError(str(error)) from error

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import attrs
 from ibrobot_provenance.jobs import Job, open_pool
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import DatasetError
 from ibrobot_core.app import Emit, Event, Failed, Unsuccessful, echo, wrong_input
@@ -120,7 +121,7 @@ def train_several(options: TrainOptions, emit: Emit) -> None:
         tell(_KEPT, Failed(_KEPT), emit, err=True)
         raise Unsuccessful(exit_code=INTERRUPTED) from None
     if failed:
-        text = f"{failed} of {len(jobs)} trainings failed; the same command continues with them"
+        text = f"{failed} of {counted(len(jobs), 'training')} failed; the same command continues with them"
         tell(text, Failed(text), emit, err=True)
         raise Unsuccessful
     if emit is not None:

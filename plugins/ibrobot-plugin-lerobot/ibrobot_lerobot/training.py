@@ -10,6 +10,7 @@ from typing import Any, override
 
 import attrs
 from ibrobot_provenance.work_options import on_option
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import MissingDependency, how_to_install, option
 from ibrobot_core.app import Event, Shown
@@ -124,7 +125,7 @@ class Begin(Event):
     @override
     def shown(self) -> Shown:
         text = f"continues from step {self.step} of" if self.step else "begins:"
-        return Shown(f"{text} {self.steps} steps", self.step / self.steps)
+        return Shown(f"{text} {counted(self.steps, 'step')}", self.step / self.steps)
 
 
 @attrs.frozen

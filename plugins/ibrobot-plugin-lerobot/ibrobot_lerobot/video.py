@@ -16,6 +16,7 @@ import attrs
 import av
 import av.error
 import numpy as np
+from ibrobot_terminal.plural import counted
 from numpy.typing import NDArray
 
 from ibrobot_core.api import DatasetError
@@ -266,7 +267,7 @@ def join_videos(parts: Sequence[tuple[Path, int]], path: Path, fps: float) -> No
                         joined.mux(packet)
                         count += 1
                 if count != frames:
-                    raise DatasetError(f"{part}: has {count} images, its table {frames} rows")
+                    raise DatasetError(f"{part}: has {counted(count, 'image')}, its table {frames} rows")
                 begin += frames
     except (av.error.FFmpegError, OSError) as error:
         raise DatasetError(f"{path}: cannot be joined: {error}") from error

@@ -48,18 +48,18 @@ def problems_of(path: Path, longest_gap: float) -> list[str]:
         known = summary.topics.get(topic)
         counted = (known.count if known is not None else 0) + repeated.get(topic, 0)
         if stated != counted:
-            problems.append(f"{topic}: {counted} messages, {METADATA} says {stated}")
+            problems.append(f"{topic}: {counted(counted, 'message')}, {METADATA} says {stated}")
     needed = _needed(contract) if contract is not None else {}
     span_ns = summary.start_ns, summary.end_ns
     for topic, known in summary.topics.items():
         if known.missing and topic not in short:
-            problems.append(f"{topic}: {known.missing} messages that the recorder wrote are missing since a repair")
+            problems.append(f"{topic}: lacks {counted(known.missing, 'message')} of the recorder, since a repair")
         if topic in times:
             problems += times[topic].problems(topic, longest_gap, needed.get(topic), span_ns)
     lost = Counter({topic: each.dropped for topic, each in summary.topics.items() if each.dropped})
     if lost:  # first, since it may explain the others
         of_each = ", ".join(f"{topic} {count}" for topic, count in lost.most_common())
-        problems.insert(0, f"{lost.total()} messages were lost while recording: {of_each}")
+        problems.insert(0, f"{counted(lost.total(), 'message')} lost while recording: {of_each}")
     return problems
 
 

@@ -199,7 +199,7 @@ def test_a_cut_episode_does_not_count_as_success_and_keeps_what_is_missing_until
     after, again = contents(path)
     assert again == messages
     assert (after.outcome, after.finished, after.topics[JOINTS].missing) == ("unknown", True, missing)
-    gap = f"{JOINTS}: {missing} messages that the recorder wrote are missing"
+    gap = f"{JOINTS}: lacks {missing} messages of the recorder"
     assert gap in run("verify", path, code=1)
     run("trim", path, "--to", "1", "-o", tmp_path / "cut")
     assert gap in run("info", tmp_path / "cut")
@@ -240,7 +240,7 @@ def test_verify_says_what_is_wrong(tmp_path):
     bench.recorder.write(JOINTS, joints(3), stamp(80))
     bench.end("success", **{JOINTS: 4})
     output = run("verify", tmp_path, code=1)
-    assert f"{bench.path}: 4 problems\n  4 messages were lost while recording: {JOINTS} 4\n" in output
+    assert f"{bench.path}: 4 problems\n  4 messages lost while recording: {JOINTS} 4\n" in output
     assert "header stamps went back 1 times" in output
     assert "a pause of 310 ms at 0.49 s, its period is 10.0 ms" in output
     assert "its contract is bbbbbbbbbbbb, that of episode_000001 is aaaaaaaaaaaa" in output

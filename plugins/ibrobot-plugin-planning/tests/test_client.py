@@ -163,7 +163,7 @@ def test_object_in_the_way(robot: SimpleNamespace):
     assert robot.client.ik(GOAL)
     block = {"shape": "box", "size": [0.1, 0.1, 0.1], "position": GOAL["xyz"]}
     robot.client.call("/world/add", {"name": "block", "object": block})
-    with pytest.raises(PlanningError, match="configurations touch something"):
+    with pytest.raises(PlanningError, match="each of its configurations touches something"):
         robot.client.ik(GOAL)
     assert robot.client.go_to(GOAL).wait().code is PlanCode.GOAL_IN_COLLISION
     links = robot.client.call("/get_planning_scene")["links"]

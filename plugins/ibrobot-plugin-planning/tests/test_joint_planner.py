@@ -166,7 +166,7 @@ REFUSED = {
     ),
     "positions missing": (
         PlanRequest(("a",), np.zeros(1), JointGoal(("a",), np.zeros(2))),
-        "goal has 1 joints but positions of shape (2,)",
+        "goal has positions of shape (2,), must be (1,)",
     ),
     "start too short": (
         PlanRequest(("a", "b"), np.zeros(1), JointGoal(("a",), np.zeros(1))),

@@ -257,7 +257,7 @@ MALFORMED = {
     ),
     "joint twice": (ask(JointGoal(("pan", "pan"), np.zeros(2))), PlanCode.INVALID_GOAL_CONSTRAINTS, "'pan' twice"),
     "another number of positions": (
-        ask(JointGoal(ARM, np.zeros(4))), PlanCode.INVALID_GOAL_CONSTRAINTS, r"5 joints but positions of shape \(4,\)",
+        ask(JointGoal(ARM, np.zeros(4))), PlanCode.INVALID_GOAL_CONSTRAINTS, r"of shape \(4,\), must be \(5,\)",
     ),
     "position that is nan": (
         ask(JointGoal(("pan",), np.array([np.nan]))), PlanCode.INVALID_GOAL_CONSTRAINTS, "joint pan is nan rad",

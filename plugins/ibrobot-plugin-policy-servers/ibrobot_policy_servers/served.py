@@ -244,13 +244,13 @@ def _joints(options: ServerOptions, robot: Sequence[str]) -> tuple[str, ...]:
                 f"actions: relative names {', '.join(others)}, not among the joints {', '.join(each.joints)}"
             )
         if each.size is not None and each.size < len(each.joints):
-            raise PolicyError(f"actions: size is {each.size}, less than the {len(each.joints)} joints")
+            raise PolicyError(f"actions: size is {each.size}, must be at least that of joints, {len(each.joints)}")
         _check_numbers("actions", each, len(each.joints))
     for seen in options.observations:
         if seen.scale or seen.offset:
             _check_numbers(seen.observation, seen, seen.shape[0] if len(seen.shape) == 1 else 0)
         if seen.joints and seen.shape != (len(seen.joints),):
-            raise PolicyError(f"{seen.observation}: has shape {list(seen.shape)}, but {len(seen.joints)} joints")
+            raise PolicyError(f"{seen.observation}: has shape {list(seen.shape)}, must be [{len(seen.joints)}]")
     return tuple(joint for joint in robot if joint in moved)
 
 

@@ -167,13 +167,13 @@ def test_observation_cannot_be_sent_twice() -> None:
         ({"actions": (ActionMap(("elbow_flx",)),)}, "the robot has no joint 'elbow_flx', did you mean 'elbow_flex'"),
         ({"actions": (ActionMap(ARM), ActionMap(ARM[:1]))}, "shoulder_pan stand twice"),
         ({"actions": (ActionMap(ARM, relative=GRIPPER),)}, "relative names gripper"),
-        ({"actions": (ActionMap(JOINTS, size=3),)}, "size is 3, less than the 6 joints"),
+        ({"actions": (ActionMap(JOINTS, size=3),)}, "size is 3, must be at least that of joints, 6"),
         ({"actions": (ActionMap(JOINTS, scale=(1.0,)),)}, "scale has 1 numbers, must have 6"),
         (
             {"actions": (ActionMap(JOINTS, relative=ARM),), "observations": OPTIONS.observations[1:]},
             "no observation names these joints",
         ),
-        ({"observations": (ObservationMap(STATE, ("s",), (2,), joints=JOINTS),)}, r"has shape \[2\], but 6 joints"),
+        ({"observations": (ObservationMap(STATE, ("s",), (2,), joints=JOINTS),)}, r"has shape \[2\], must be \[6\]"),
     ],
 )
 def test_a_mapping_that_does_not_fit_the_robot_is_refused(changes: dict[str, Any], message: str) -> None:

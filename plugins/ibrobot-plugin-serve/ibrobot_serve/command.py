@@ -17,6 +17,7 @@ from typing import Any
 
 import attrs
 from ibrobot_http.probes import ProbeServer
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import Context, Policy, RealClock, Robot, Transport, TransportDescriptor, option
 from ibrobot_core.app import (
@@ -317,7 +318,7 @@ def _line(statistics: dict[str, Any]) -> str:
     return (
         "{requests} requests, {answered} answered, {expired} expired, {malformed} malformed, {waiting} waiting | "
         "latency p50 {latency_p50_ms:.1f} ms, p99 {latency_p99_ms:.1f} ms | ".format_map(statistics)
-        + f"{len(statistics['robots'])} robots"
+        + f"{counted(len(statistics['robots']), 'robot')}"
     )
 
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import attrs
 import numpy as np
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import NS_PER_S, IbrobotError, Payload, PictureCodec, Policy, PolicyError, Tensors, Transport
 from ibrobot_core.app import WireError
@@ -311,7 +312,7 @@ class InferenceService:
         self._pacing.ask(message.robot, arrived_ns)
         replaced = self._queue.put(message.robot, ticket)
         if replaced is ticket:
-            ticket.refuse(f"the server is full: {self._options.queue} requests are waiting")
+            ticket.refuse(f"the server is full: {counted(self._options.queue, 'request')} waiting")
         elif replaced is not None:
             replaced.fail(f"dropped: replaced by the newer request {message.id} of this robot")
         try:
@@ -408,7 +409,7 @@ class InferenceService:
             requests = [ticket.message.tensors for ticket in live]
             outputs = [copy.deepcopy(dict(each)) for each in self._policy.infer_batch(requests)]
             if len(outputs) != len(live):
-                raise PolicyError(f"{len(outputs)} outputs for a batch of {len(live)}")
+                raise PolicyError(f"{counted(len(outputs), 'output')} for a batch of {len(live)}")
         except Exception as error:  # noqa: BLE001 - contained: the request is refused
             if len(live) == 1:
                 live[0].fail(self._error_text(error), model=self._checked(live[0].message.tensors))

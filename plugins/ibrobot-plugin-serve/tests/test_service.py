@@ -287,7 +287,7 @@ def test_a_full_queue_turns_away_what_comes():
     with served(queue=2, batch=1) as cloud:
         cloud.busy()
         waiting = [cloud.asked(f"robot {i}", i) for i in (1, 2)]
-        assert failure(cloud.ask("robot 3", 3)) == "refused: the server is full: 2 requests are waiting"
+        assert failure(cloud.ask("robot 3", 3)) == "refused: the server is full: 2 requests waiting"
         newer = cloud.ask("robot 2", 4)
         assert "replaced by" in failure(waiting[1]), "it needs no further place"
         cloud.policy.gate.release(10)

@@ -13,6 +13,7 @@ from typing import Any
 
 import attrs
 import numpy as np
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import (
     JOINT_STATES,
@@ -259,9 +260,9 @@ def problems_of(summary: EpisodeSummary) -> list[str]:
     problems = [] if summary.finished else ["unfinished: its recorder was killed, or the file is cut off"]
     for topic, known in summary.topics.items():
         if known.dropped:
-            problems.append(f"{topic}: {known.dropped} messages were lost while recording")
+            problems.append(f"{topic}: {counted(known.dropped, 'message')} lost while recording")
         if known.missing:
-            problems.append(f"{topic}: {known.missing} recorded messages cannot be read")
+            problems.append(f"{topic}: {counted(known.missing, 'recorded message')} cannot be read")
     return problems
 
 

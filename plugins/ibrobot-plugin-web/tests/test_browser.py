@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import math
 import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy as np
 import pytest
+from ibrobot_terminal.panel import Joints
+from ibrobot_terminal.screen import Screen
 
 from ibrobot_core.app import installed_plugins
 
@@ -161,6 +166,43 @@ def test_the_page_shows_the_robot_and_asks_no_other_host(tab: Tab, address: str)
         toggle.click()
         assert tab.page.locator("#panels > :visible").count() == 0
     assert tab.hosts == {address.split("/")[2]}
+
+
+MINUS = "\N{MINUS SIGN}"
+JOINTS = """async ([joints, slides, position, unit]) => {
+  const { Joints } = await import("/static/joints.js");
+  const { deadman } = window.ibrobot, section = document.createElement("section");
+  localStorage.setItem("angles", unit);
+  const shown = new Joints(section, { deadman, view: { slides }, jogs: [], mode: null, device: null });
+  shown.update({ robot: { joints } });
+  shown.state({ position, command: position });
+  localStorage.removeItem("angles");
+  return [...section.querySelectorAll("output")].map((each) => each.textContent);
+}"""
+"""The positions of joints on the page, in a unit that was chosen in this browser before."""
+
+
+def test_joints_have_the_numbers_of_the_panel_in_the_terminal(tab: Tab) -> None:
+    names, position = ("arm", "wrist", "grip", "rail"), (-1.23456, -0.0001, 0.03456, 0.7004)
+    upper = (3.0, 2.0, 0.8, 0.9)
+    joints = [
+        SimpleNamespace(name=name, lower=-0.05, upper=most) for name, most in zip(names, upper, strict=True)
+    ]  # fmt: skip
+    state = SimpleNamespace(position=np.array(position), command=np.array(position))
+    session: Any = SimpleNamespace(state=state, config=SimpleNamespace(robot=SimpleNamespace(joints=joints)))
+    drawn = io.StringIO()
+    Screen(file=drawn, width=50).print(Joints(cast("Any", SimpleNamespace(session=session))))
+    heading, *rows = drawn.getvalue().splitlines()
+    assert heading == "joints [rad, or m where they slide]"
+    panel = {name: shown.removeprefix("+") for name, shown in (row.split()[:2] for row in rows)}
+    assert panel == {"arm": "-1.23", "wrist": "0.00", "grip": "0.035", "rail": "0.700"}
+
+    def page(unit: str) -> list[str]:
+        shown = tab.page.evaluate(JOINTS, [[vars(each) for each in joints], ["rail"], position, unit])
+        return [each.replace(MINUS, "-") for each in shown]
+
+    assert page("rad") == [f"{panel[name]} {'m' if name == 'rail' else 'rad'}" for name in names]
+    assert page("deg") == ["-71°", "0°", "2°", "700 mm"], "the choice of a browser"
 
 
 def test_a_held_button_moves_a_joint_and_leaving_the_page_stops_it(tab: Tab) -> None:

@@ -105,6 +105,9 @@ LATER = """async () => {
 """A text of the table after many others were looked up, as on the page of a run."""
 
 
+SAID = """async (text) => (await import("/static/words.js")).words(text)"""
+
+
 @pytest.mark.integration
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
 def test_no_english_sentence_is_left_in_a_chinese_browser(tmp_path: Path) -> None:
@@ -143,5 +146,7 @@ def test_no_english_sentence_is_left_in_a_chinese_browser(tmp_path: Path) -> Non
         assert heading.startswith("2. 防碰保护在 55 % 的运行时间里")
         assert called == f"{button}: 1. a", "a person who speaks what stands on the button finds it"
         assert page.evaluate(LATER) == "数据集"
+        for text, shown in (("1 of 1 episode", "1 / 1 个回合"), ("1 more episode", "1 more episode")):
+            assert page.evaluate(SAID, text) == shown, "one entry for all numbers"
         browser.close()
     assert errors == []

@@ -15,6 +15,7 @@ from rich.segment import Segment
 from rich.table import Table
 
 from ibrobot_core.api import String
+from ibrobot_terminal.plural import counted
 from ibrobot_terminal.screen import styled
 
 if TYPE_CHECKING:
@@ -27,8 +28,10 @@ KEYS = {"Esc": "emergency stop", "F10": "reset", "Ctrl-C": "end"}
 _LOG_LINES = 6
 _LINES_PER_LOG_LINE = 6
 """Height of the terminal for each line of messages [lines]."""
-_JOINT_WIDTH = 41
+_JOINT_WIDTH = 43
 """Width of a joint's name and numbers [columns]."""
+_SHORT = 1.0
+"""Range of joints whose positions have a third digit [rad or m]."""
 
 
 class RecentLog(logging.Handler):
@@ -69,7 +72,7 @@ def panel(
         modes,
         *(styled(each, "cyan") for each in (source, help_text) if each),
         *_rows(_facts(display)),
-        _Joints(display),
+        Joints(display),
     )
 
 
@@ -125,7 +128,7 @@ def _facts(display: RunDisplay) -> Iterator[tuple[str, str]]:
         stats = session.acting.dispatch
         yield (
             "plan",
-            f"{stats.plan_length} actions by {stats.strategy}, latency p50 {stats.latency_p50_ms:.0f}, p99 "
+            f"{counted(stats.plan_length, 'action')} by {stats.strategy}, latency p50 {stats.latency_p50_ms:.0f}, p99 "
             f"{stats.latency_p99_ms:.0f} ms, holds {stats.holds}, "
             f"unreachable {stats.unreachable}, failures {stats.failures}",
         )
@@ -155,8 +158,8 @@ class _Newest:
             yield Segment.line()
 
 
-class _Joints:
-    """Position and command of each joint; in wide terminals, also a bar between the limits."""
+class Joints:
+    """Position and command of each joint, as on the page of a run; in wide terminals, also a bar between the limits."""
 
     def __init__(self, display: RunDisplay) -> None:
         self._display = display
@@ -171,6 +174,9 @@ class _Joints:
             done = float(np.clip((state.position[i] - joint.lower) / (joint.upper - joint.lower), 0.0, 1.0))
             room = max(0, options.max_width - _JOINT_WIDTH)
             bar = [ProgressBar(total=1.0, completed=done, width=min(room, 30))] if room else []
-            target = styled(f"target {state.command[i]:+.2f}", "dim")
-            table.add_row(joint.name, f"{state.position[i]:+.2f}", target, *bar)
+            digits = 3 if joint.upper - joint.lower < _SHORT else 2
+            position, command = (
+                f"{round(float(each[i]), digits) + 0.0:+.{digits}f}" for each in (state.position, state.command)
+            )
+            table.add_row(joint.name, position, styled(f"target {command}", "dim"), *bar)
         yield table

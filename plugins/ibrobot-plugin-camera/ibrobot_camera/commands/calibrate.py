@@ -12,6 +12,7 @@ import attrs
 import cv2
 import numpy as np
 from ibrobot_terminal import Guide, Question
+from ibrobot_terminal.plural import counted
 from numpy.typing import NDArray
 
 from ibrobot_camera.intrinsics.board import PAPERS, Board
@@ -46,7 +47,7 @@ class MakeBoard(Board):
     def __call__(self) -> None:
         with wrong_input():
             self.save(self.output, self.paper)
-        echo(f"{self.output}: {self.columns}x{self.rows} squares of {self.square:g} mm on {self.paper}")
+        echo(f"{self.output}: {self.columns}x{counted(self.rows, 'square')} of {self.square:g} mm on {self.paper}")
         echo(_PRINT)
 
 
@@ -118,7 +119,7 @@ class CalibrateCamera(Board):
         while (now_s := time.monotonic()) < end_s and (missing := views.missing(self.views)):
             if missing != hint and now_s > told_s + _HINT_S:
                 hint, told_s = missing, now_s
-                echo(f"{len(views.views)} of {self.views} views; {hint}")
+                echo(f"{len(views.views)} of {counted(self.views, 'view')}; {hint}")
             picture = read(min(1.0, end_s - now_s))
             if picture is not None and views.add_live(self._find(picture, f"view {len(views.views) + 1}")):
                 echo("\a", nl=False)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import yaml
 from ibrobot_provenance.files import replace_file
+from ibrobot_terminal.plural import counted
 from numpy.typing import NDArray
 
 from ibrobot_camera.intrinsics.views import CELLS, View, by_size
@@ -60,8 +61,8 @@ class Intrinsics:
             f"focal length {fx:.1f} ± {uncertain[0]:.1f}, {fy:.1f} ± {uncertain[1]:.1f} px; "
             f"centre {cx:.1f} ± {uncertain[2]:.1f}, {cy:.1f} ± {uncertain[3]:.1f} px",
             f"distortion {', '.join(f'{value:.4f}' for value in self.distortion)}",
-            f"{self.rms:.2f} px reprojection error in {len(self.errors)} views; worst {self.errors[worst]:.2f} px "
-            f"({worst})",
+            f"{self.rms:.2f} px reprojection error in {counted(len(self.errors), 'view')}; worst "
+            f"{self.errors[worst]:.2f} px ({worst})",
         ]
         lines += [f"left out: {name}, {error:.2f} px" for name, error in self.dropped.items()]
         return lines
@@ -110,7 +111,8 @@ def solve(views: Sequence[View]) -> Intrinsics:
         if len(used) < FEWEST_VIEWS:
             left_out = f" ({len(dropped)} did not fit and were left out)" if dropped else ""
             raise SensorError(
-                f"{len(used)} views{left_out}; at least {FEWEST_VIEWS} are needed, from different sides and distances"
+                f"{counted(len(used), 'view')}{left_out}; at least {FEWEST_VIEWS} are needed, from different sides and "
+                "distances"
             )
         result = _solved(used, dropped)
         errors = np.array(list(result.errors.values()))

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from itertools import combinations
 
 import numpy as np
+from ibrobot_terminal.plural import counted
 
 from ibrobot_camera.mounting.closed import scale_of, turns
 from ibrobot_camera.mounting.fit import USUAL, Fit, Session
@@ -46,7 +47,7 @@ def check_count(shots: int, *, measured: bool, seen: str) -> None:
     """
     least = FEWEST_MEASURED if measured else FEWEST
     if shots < least:
-        raise SensorError(f"{shots} pictures can be used, at least {least} are needed{seen}")
+        raise SensorError(f"{counted(shots, 'picture')} can be used, at least {least} are needed{seen}")
 
 
 def check_turns(session: Session) -> None:
@@ -94,8 +95,8 @@ def explain(session: Session, fit: Fit) -> None:
             raise SensorError(_square(scale))
     if bad and fit.used.mean() < LEAST_USED:
         raise SensorError(
-            f"only {fit.used.sum()} of {len(fit.used)} pictures agree with one another: were camera and board fixed, "
-            "and are these the joints, the zeros and the URDF of this arm?"
+            f"of {counted(len(fit.used), 'picture')} only {fit.used.sum()} agree with one another: were camera and "
+            "board fixed, and are these the joints, the zeros and the URDF of this arm?"
         )
 
 

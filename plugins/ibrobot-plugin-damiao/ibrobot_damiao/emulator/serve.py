@@ -10,6 +10,7 @@ from contextlib import suppress
 from typing import Self, override
 
 import attrs
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import option
 from ibrobot_core.app import RequestError, echo, go_real_time, on_signals
@@ -155,5 +156,5 @@ class Emulate:
             for refused in go_real_time(_PRIORITY):
                 echo(refused, err=True)
             echo(server.channel)
-            echo(f"{self.motors} motors; Ctrl-C ends it", err=True)
+            echo(f"{counted(self.motors, 'motor')}; Ctrl-C ends it", err=True)
             ended.wait()

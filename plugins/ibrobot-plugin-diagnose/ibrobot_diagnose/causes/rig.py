@@ -101,7 +101,7 @@ class CameraMissing(RigCause):
         if missing:
             text = f"{', '.join(missing)} of the reference deliver{'s' * (len(missing) == 1)} no picture. {why}".strip()
         else:
-            text = f"All {len(then.cameras)} cameras of the reference deliver pictures."
+            text = f"All cameras of the reference deliver pictures: {len(then.cameras)}."
         number = float(len(missing))
         return Evidence(text, number, "cameras", 1.0, likelihood(number, 0.5, 1.0), fails=1.0)
 

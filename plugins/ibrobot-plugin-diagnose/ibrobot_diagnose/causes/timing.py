@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import override
 
 import numpy as np
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import NS_PER_S
 from ibrobot_diagnose.card import Card
@@ -179,8 +180,8 @@ class TicksMissed(Cause):
         if not long.any():
             return None
         text = (
-            f"The control loop missed {100 * share:.1f} % of its ticks: {int(long.sum())} pauses, the longest "
-            f"{gaps.max() / 1e6:.0f} ms with {usual / 1e6:.0f} ms between its states."
+            f"The control loop missed {100 * share:.1f} % of its ticks: {counted(int(long.sum()), 'pause')}, the "
+            f"longest {gaps.max() / 1e6:.0f} ms with {usual / 1e6:.0f} ms between its states."
         )
         since = window.since(int(times[:-1][long][0]))
         return Evidence(text, 100 * share, "%", 3.0, likelihood(share, 0.03, 0.12), since)

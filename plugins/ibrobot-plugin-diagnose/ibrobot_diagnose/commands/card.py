@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import attrs
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import option
 from ibrobot_core.app import RequestError, echo, wrong_input
@@ -37,4 +38,4 @@ class MakeCard:
         card = make_card(windows_of(self.dataset), trained=trained)
         out = self.out or self.dataset / CARD
         card.write(out)
-        echo(f"card of {card.episodes} episodes, {card.frames} frames -> {out}", err=True)
+        echo(f"card of {counted(card.episodes, 'episode')}, {counted(card.frames, 'frame')} -> {out}", err=True)

@@ -11,6 +11,7 @@ from typing import Any
 import attrs
 import numpy as np
 from ibrobot_provenance.jobs import Job, open_pool
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import DatasetError, RecorderError
 from ibrobot_core.app import Emit, Unsuccessful, echo, wrong_input
@@ -175,7 +176,7 @@ def check_episode(order: tuple[Path, Card], progress: Callable[[int], None] = la
     window = attrs.evolve(read_episode(episode), teaches=True)
     if "state" not in window.streams:
         raise RecorderError(
-            f"{episode}: nothing can be checked: it has {len(window.state.times_ns)} readings of joints"
+            f"{episode}: nothing can be checked: it has {counted(len(window.state.times_ns), 'reading')} of joints"
         )
     diagnosis = diagnose(window, Reference(card))
     findings = diagnosis.findings
@@ -197,9 +198,9 @@ def _seen(window: Window, at_s: float) -> Iterator[Shown]:
 def lines_of(checked: Mapping[str, Any]) -> list[str]:
     """A line for each listed episode, worst first, and each cause with a mistake; at last the counts."""
     listed, of = checked["listed"], checked["episodes"] - len(checked["unreadable"])
-    lacking = f"{len(checked['unreadable'])} of {checked['episodes']} episodes could not be read"
+    lacking = f"{len(checked['unreadable'])} of {counted(checked['episodes'], 'episode')} could not be read"
     untested = [
-        f"Not tested{'' if each['episodes'] == of else f' in {each["episodes"]} of {of} episodes'}: "
+        f"Not tested{'' if each['episodes'] == of else f' in {each["episodes"]} of {counted(of, "episode")}'}: "
         f"{each['name']}, since {each['why']}."
         for each in checked["untested"]
     ]
@@ -207,11 +208,11 @@ def lines_of(checked: Mapping[str, Any]) -> list[str]:
         return [*untested, f"Nothing was checked: {lacking}."]
     rest = f"; {lacking}" if checked["unreadable"] else ""
     if not listed:
-        return [*untested, f"All {of} episodes are like one another: nothing was found{rest}."]
+        return [*untested, f"Nothing was found in {counted(of, 'episode')}{rest}."]
     lines = []
     for each in listed:
         first, *others = each["causes"]
         more = f" Also: {', '.join(other['name'] for other in others)}." if others else ""
         lines.append(f"{each['episode']}: {first['text']}{more}")
     names = ", ".join(f"{name} {count}" for name, count in checked["counts"].items())
-    return [*lines, *untested, f"{len(listed)} of {of} episodes to look at: {names}{rest}"]
+    return [*lines, *untested, f"{len(listed)} of {counted(of, 'episode')} to look at: {names}{rest}"]

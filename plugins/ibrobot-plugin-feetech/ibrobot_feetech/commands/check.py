@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import attrs
 from ibrobot_calibration import Calibration, load_calibration
 from ibrobot_terminal import Guide
+from ibrobot_terminal.plural import counted
 from ibrobot_terminal.questions import Declined
 
 from ibrobot_core.api import option
@@ -99,7 +100,7 @@ def check_arm(
         _print(guide, differing)
     if reversed_ or any(each.matters for each in differing):
         return False
-    guide.say(f"{len(calibration.joints)} servos match the calibration")
+    guide.say(f"{counted(len(calibration.joints), 'servo')} as in the calibration")
     return True
 
 

@@ -8,6 +8,7 @@ import attrs
 import numpy as np
 from ibrobot_calibration import load_calibration
 from ibrobot_terminal import Guide
+from ibrobot_terminal.plural import counted
 from ibrobot_terminal.questions import Declined
 
 from ibrobot_core.api import HardwareError, Vector, option
@@ -90,7 +91,7 @@ def compare_arms(
             guide.say(text, warning=True)
     fails = sum(row[-1] == "FAIL" for row, _ in verdicts)
     if not fails:
-        guide.say(f"{len(joints)} joints compared in {len(POSES)} poses: none fails")
+        guide.say(f"{counted(len(joints), 'joint')} compared in {counted(len(POSES), 'pose')}: none fails")
     return not fails
 
 

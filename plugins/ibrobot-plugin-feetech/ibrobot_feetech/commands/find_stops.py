@@ -17,6 +17,7 @@ from enum import Enum
 import attrs
 import numpy as np
 from ibrobot_terminal import Guide
+from ibrobot_terminal.plural import counted
 from ibrobot_terminal.questions import Declined
 
 from ibrobot_core.api import CalibrationError, HardwareError
@@ -297,7 +298,7 @@ class StopFinder:
         for row, servo in enumerate(self._ids):
             self._missed[servo] = 0 if replies.answered[row] else self._missed[servo] + 1
             if self._missed[servo] > _LOST:
-                raise NoReply(self._bus.place(servo), f"no valid reply for {self._missed[servo]} readings")
+                raise NoReply(self._bus.place(servo), f"no valid reply for {counted(self._missed[servo], 'reading')}")
             if not replies.answered[row]:
                 continue
             place = self._bus.place(servo)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import attrs
 from ibrobot_calibration import Calibration, calibration_path, load_calibration
+from ibrobot_terminal.plural import counted
 from ibrobot_terminal.questions import Declined
 
 from ibrobot_core.api import CalibrationError, HardwareError, option
@@ -101,7 +102,9 @@ def _hint(file: str, plain: Sequence[str]) -> str:
     if fitting:
         return f"; give --prefix {' or --prefix '.join(fitting)}"
     if len(known) != len(plain):
-        return f"; the file has {len(known)} joints, the arm {len(plain)}: give the robot YAML of its arm by --robot"
+        return (
+            f"; the file has {counted(len(known), 'joint')}, the arm {len(plain)}: name the YAML of its arm by --robot"
+        )
     return ""
 
 

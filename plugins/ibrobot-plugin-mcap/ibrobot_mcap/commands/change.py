@@ -10,6 +10,7 @@ from typing import Any
 
 import attrs
 from ibrobot_provenance.ownership import InUse
+from ibrobot_terminal.plural import counted
 from ibrobot_terminal.questions import Declined, confirm
 
 from ibrobot_core.api import EpisodeSummary, RecorderError, option
@@ -77,7 +78,7 @@ class Trim:
         else:
             made = trash.copy_part(episode, self.output, begin_s, end_s)
         count = sum(topic.count for topic in made.topics.values())
-        what = f"{count} messages, {duration_s(made):.2f} s{stated_outcome_text(made)}"
+        what = f"{counted(count, 'message')}, {duration_s(made):.2f} s{stated_outcome_text(made)}"
         _report(emit, Changed(str(made.path), what))
 
 
@@ -204,7 +205,7 @@ class Repair:
             what = "is whole"
             if made is not None:
                 count = sum(topic.count for topic in made.topics.values())
-                what = f"repaired, {count} messages, {duration_s(made):.2f} s{_description(made)}"
+                what = f"repaired, {counted(count, 'message')}, {duration_s(made):.2f} s{_description(made)}"
             _report(emit, Changed(str(episode), what))
         if failed:
             raise Unsuccessful

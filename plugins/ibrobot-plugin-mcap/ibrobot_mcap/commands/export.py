@@ -10,6 +10,7 @@ from typing import Any
 
 import attrs
 import numpy as np
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import Image, Message, RecorderError, option
 from ibrobot_core.app import echo, wrong_input
@@ -49,7 +50,7 @@ class Export:
                 raise RecorderError(f"{self.output}: cannot be written: {error.strerror}") from error
             finally:
                 _remove(making)
-        echo(f"{self.output}: {count} messages of {self.topic}")
+        echo(f"{self.output}: {counted(count, 'message')} of {self.topic}")
 
 
 def _remove(making: Path) -> None:
@@ -131,6 +132,6 @@ def pixels_of(image: Image) -> np.ndarray[Any, Any]:
     if image.encoding == "mono8":
         return rows[:, : image.width]
     if image.encoding not in _TO_RGB:
-        raise RecorderError(f"{image.encoding} images cannot be saved as PNG")
+        raise RecorderError(f"{counted(image.encoding, 'image')} cannot be saved as PNG")
     order = _TO_RGB[image.encoding]
     return rows[:, : len(order) * image.width].reshape(image.height, image.width, len(order))[:, :, order]

@@ -7,6 +7,8 @@ from contextlib import closing, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
+from ibrobot_terminal.plural import counted
+
 from ibrobot_core.api import NS_PER_S, EpisodeSummary, RecorderError
 from ibrobot_mcap.metadata import STATED
 from ibrobot_mcap.owning import interrupted, is_owned
@@ -42,7 +44,7 @@ def opened(path: Path) -> Iterator[Rosbag2Reader]:
         raise RecorderError(f"{path}: there is no such episode")
     if path.is_dir() and not is_rosbag2(path):
         episodes = episodes_in(path)
-        count = "an episode" if len(episodes) == 1 else f"{len(episodes)} episodes"
+        count = "an episode" if len(episodes) == 1 else f"{counted(len(episodes), 'episode')}"
         raise RecorderError(f"{path}: is a folder with {count}; choose one, e.g. {episodes[0]}")
     with closing(Rosbag2Reader(path)) as reader:
         yield reader

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_terminal.plural import counted
 from ibrobot_terminal.screen import Screen, styled
 from rich.table import Table
 
@@ -139,7 +140,7 @@ class ShowEpisode:
         console.print(table)
         for name, topic in summary.topics.items():
             if topic.missing:
-                console.print(f"{name}: {topic.missing} messages that the recorder wrote are missing", soft_wrap=True)
+                console.print(f"{name}: lacks {counted(topic.missing, 'message')} of the recorder", soft_wrap=True)
         for key, value in summary.metadata.items():
             shown = value if len(value) <= _LONG else f"({len(value)} characters; --json shows them)"
             console.print(f"{key}: {shown}", soft_wrap=True)

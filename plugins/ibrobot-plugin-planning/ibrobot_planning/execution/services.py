@@ -175,7 +175,7 @@ class PlanningServices:
         if not free:
             contacts = checks.contacts(candidates[0].joints)
             raise PlanningError(
-                f"all {len(candidates)} configurations touch something: {'; '.join(map(str, contacts[:3]))}",
+                f"each of its configurations touches something: {'; '.join(map(str, contacts[:3]))}",
                 PlanCode.NO_IK_SOLUTION,
             )
         return free

@@ -109,7 +109,7 @@ def joint_target(goal: JointGoal | NamedGoal, robot: Robot, joints: Sequence[str
     goal = named
     positions = np.asarray(goal.positions, dtype=float)
     if positions.shape != (len(goal.joints),):
-        raise invalid_goal(f"goal has {len(goal.joints)} joints but positions of shape {positions.shape}")
+        raise invalid_goal(f"goal has positions of shape {positions.shape}, must be ({len(goal.joints)},)")
     if not 0 <= goal.tolerance < np.inf:
         raise invalid_goal(f"goal has a tolerance of {goal.tolerance} rad, must be at least 0")
     target = np.array(start, dtype=float)

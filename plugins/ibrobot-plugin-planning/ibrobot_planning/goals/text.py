@@ -103,7 +103,7 @@ def _joint_target(goal: JointGoal, robot: Robot, velocity_scaling: float) -> Tar
         return Target(_described(goal), goal, velocity_scaling=velocity_scaling)
     positions = dict(zip(goal.joints, map(float, goal.positions), strict=False))
     if len(positions) != len(goal.joints) or len(goal.positions) != len(goal.joints):
-        raise invalid_goal(f"goal has {len(goal.joints)} joints and {len(goal.positions)} positions, each joint once")
+        raise invalid_goal(f"goal has joints: {len(goal.joints)}, positions: {len(goal.positions)}, each joint once")
     for joint, value in positions.items():
         if not math.isfinite(value):
             raise invalid_goal(f"goal of joint {joint} is {value}, must be an angle in radians")
@@ -122,7 +122,7 @@ def _described(goal: Goal) -> str:
         case AnyGoal(goals=goals) if goals:
             words = _described(goals[0])
         case LinearGoal(waypoints=waypoints):
-            words = f"line through {len(waypoints)} waypoints"
+            words = f"line through {len(waypoints)} waypoint{'' if len(waypoints) == 1 else 's'}"
         case ConstrainedGoal(goal=constrained, constraints=constraints):
             words = f"{_described(constrained)} {constraints.text}"
     return words

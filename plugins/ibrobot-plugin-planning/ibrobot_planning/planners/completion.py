@@ -161,7 +161,7 @@ def _field(rows: list[Vector], name: str, number: int) -> Vector | None:
         return None
     for index, row in enumerate(rows):
         if row.shape != (number,):
-            raise _invalid(f"point {index} of the trajectory has {row.size} {name} for {number} joints")
+            raise _invalid(f"point {index} of the trajectory has {row.size} {name}, not {number}")
         # Written so that NaN fails it.
         if not (np.abs(row) <= _PLAUSIBLE).all():
             raise _invalid(f"point {index} of the trajectory has {name} that are not finite, or beyond {_PLAUSIBLE:g}")

@@ -46,7 +46,9 @@ class CheckTask(ConfigOptions):
     def __call__(self) -> None:
         robot = self.load()
         checked = _checked(_read(self.file, self.parameters), robot, installed_plugins())
-        echo(f"{self.file}: {len(checked.file.task.steps)} steps for {robot.robot.name}, in mode {checked.mode.name}")
+        steps = len(checked.file.task.steps)
+        counted = f"{steps} step{'' if steps == 1 else 's'}"
+        echo(f"{self.file}: {counted} for {robot.robot.name}, in mode {checked.mode.name}")
 
 
 @attrs.frozen(kw_only=True)

@@ -166,7 +166,7 @@ class WorldKeeper(Component):
     def __init__(self, options: WorldOptions, session: RunView) -> None:
         scene = scene_objects(session.config)
         self._world = first_world(options, scene)
-        super().__init__("world", f"{len(self._world.objects)} objects for planners", ())
+        super().__init__("world", f"objects for planners: {len(self._world.objects)}", ())
         self._session = session
         self._of_agents: set[str] = set()
         """Names of objects that agents have added."""

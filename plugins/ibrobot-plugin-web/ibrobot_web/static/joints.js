@@ -5,6 +5,7 @@ import { words } from "./words.js";
 
 const KEY = "angles";
 const DEGREES = 180 / Math.PI;
+const SHORT = 1; // range of joints whose positions have a third digit [rad or m]
 
 export class Joints {
   constructor(section, page) {
@@ -72,8 +73,9 @@ export class Joints {
       const i = row.index;
       const { lower, upper, name } = row.joint;
       const share = (value) => `${100 * Math.min(1, Math.max(0, (value - lower) / (upper - lower)))}%`;
-      say(row.value, this.page.view.slides.includes(name) ? `${signed(position[i] * 1000, 0)} mm`
-        : this.degrees ? `${signed(position[i] * DEGREES, 0)}°` : `${signed(position[i], 2)} rad`);
+      const slides = this.page.view.slides.includes(name), digits = upper - lower < SHORT ? 3 : 2; // as in the panel
+      say(row.value, this.degrees ? (slides ? `${signed(position[i] * 1000, 0)} mm` : `${signed(position[i] * DEGREES, 0)}°`)
+        : `${signed(position[i], digits)} ${slides ? "m" : "rad"}`);
       row.bar.style.width = share(position[i]);
       row.command.style.left = share(command[i]);
       const beyond = (upper - lower) / 200; // a joint that rests at its limit is not outside

@@ -11,6 +11,7 @@ const filled = Object.entries(table).filter(([text]) => text.includes("{}")).sor
 const known = new Map(Object.entries(table));
 const before = new Map(); // what was looked up
 const MOST = 2000;
+const ONE = /\b1 ((?:more |other |recorded )?[a-z]+)\b/g;
 
 // A text in the language of the browser; what no table has stays as it is.
 export function words(text) {
@@ -22,16 +23,20 @@ export function words(text) {
 function lookUp(text) {
   let found = known.get(text) ?? before.get(text);
   if (found === undefined) {
-    found = text;
-    for (const [pattern, template] of filled) {
-      const match = pattern.exec(text);
-      if (!match) continue;
-      let i = 0;
-      found = template.replaceAll("{}", () => words(match[++i]));
-      break;
-    }
+    const many = text.replace(ONE, "1 $1s"); // tables have one entry for `1 episode` and `2 episodes`
+    found = filledIn(text) ?? (many === text ? undefined : known.get(many) ?? filledIn(many)) ?? text;
     if (before.size > MOST) before.clear();
     before.set(text, found);
   }
   return found;
+}
+
+function filledIn(text) {
+  for (const [pattern, template] of filled) {
+    const match = pattern.exec(text);
+    if (!match) continue;
+    let i = 0;
+    return template.replaceAll("{}", () => words(match[++i]));
+  }
+  return undefined;
 }

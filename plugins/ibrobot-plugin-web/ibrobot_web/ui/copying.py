@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import attrs
+from ibrobot_terminal.plural import counted
 from ibrobot_terminal.questions import prompt
 
 from ibrobot_core.api import option
@@ -132,4 +133,4 @@ class CopyConfig:
                 echo(f"note: {name}={given} of the environment outranks the file", err=True)
         loaded = load_config(self.copy)
         body = "simulation" if loaded.simulated else "hardware"
-        echo(f"{self.copy}: ok ({loaded.robot.name}, {len(loaded.robot.joints)} joints, {body})")
+        echo(f"{self.copy}: ok ({loaded.robot.name}, {counted(len(loaded.robot.joints), 'joint')}, {body})")

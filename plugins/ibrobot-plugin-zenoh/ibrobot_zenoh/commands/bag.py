@@ -11,6 +11,7 @@ import attrs
 from ibrobot_ros2.convert import make_class
 from ibrobot_ros2.definitions import standard_types
 from ibrobot_ros2.offers import CLOCK, CLOCK_TYPE
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import (
     NS_PER_S,
@@ -80,7 +81,7 @@ class Play(OnNetwork):
                     player.play(reader.messages_since(start_ns, list(chosen)), start_ns)
                     if not self.loop:
                         break
-            echo(f"{player.count} messages on {len(chosen)} topics")
+            echo(f"{counted(player.count, 'message')} on {counted(len(chosen), 'topic')}")
 
 
 @attrs.define

@@ -12,6 +12,7 @@ from typing import Any, override
 
 import attrs
 import numpy as np
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import MESSAGE_TYPES, Message, NotSupported, TransportError, did_you_mean, option
 from ibrobot_core.app import RequestError, dump_yaml, echo, single_options
@@ -99,7 +100,8 @@ class Rate(_OnTopics):
                 echo(f"fewer than two messages on {self.name} in {self.period:g} s")
                 continue
             rate = len(gaps) / sum(gaps)
-            echo(f"{rate:.2f} Hz, gaps {min(gaps) * 1e3:.1f} to {max(gaps) * 1e3:.1f} ms, {len(gaps)} messages")
+            between = f"{min(gaps) * 1e3:.1f} to {max(gaps) * 1e3:.1f} ms"
+            echo(f"{rate:.2f} Hz, gaps {between}, {counted(len(gaps), 'message')}")
 
 
 @attrs.frozen(kw_only=True)
