@@ -22,7 +22,7 @@ def test_check_of_a_good_file(ibrobot: Ibrobot, robot: Path) -> None:
 
     assert (ran.code, ran.err) == (0, "")
     assert ran.out.splitlines() == [
-        "mini.yaml: ok (mini, 1 joints, hardware)",
+        "mini.yaml: ok (mini, 1 joint, hardware)",
         "joints brake from full speed within 200 ms",
         "modes: idle; starts in idle",
     ]

@@ -159,7 +159,7 @@ def test_a_server_whose_model_hangs_starts_again(
         process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=60)
         assert process.returncode == 0
-        assert "1 requests, 1 answered" in out
+        assert "1 request, 1 answered" in out
         assert "E the server restarts, with the same command line" in err
     finally:
         remote.close()

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+from ibrobot_terminal.plural import measured
 
 from ibrobot_core.app import Event, RobotConfig
 from ibrobot_diagnose.arm_view import with_moving
@@ -127,7 +128,7 @@ def _limits(finding: Finding) -> str:
     numbers = [f"warns from {evidence.threshold:.3g}"]
     if evidence.fails is not None:
         numbers.append(f"fails from {evidence.fails:.3g}")
-    return f"[{evidence.number:.3g} {evidence.unit}; {', '.join(numbers)}]"
+    return f"[{measured(evidence.number, evidence.unit)}; {', '.join(numbers)}]"
 
 
 def _line_facts(finding: Finding) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import Any
 from ibrobot_provenance.files import replace_file
 from ibrobot_provenance.report_page import as_page
 from ibrobot_provenance.reports import Case, Cases, ReportSection, Table, Text
+from ibrobot_terminal.plural import measured
 
 from ibrobot_diagnose.cause import Finding
 from ibrobot_diagnose.contents import read_facts, read_sections
@@ -53,7 +54,7 @@ def contents_of(facts: Mapping[str, Any], out: Path) -> list[ReportSection]:
     rows = tuple(
         (
             _VERDICTS.get(each["verdict"], each["verdict"]), each["name"], each["text"],
-            f"{each['number']:.3g} {each['unit']}",
+            measured(each["number"], each["unit"]),
             f"{each['threshold']:.3g}", "" if each["fails"] is None else f"{each['fails']:.3g}",
         )
         for each in facts["lines"]

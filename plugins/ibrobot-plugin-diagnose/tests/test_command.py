@@ -117,7 +117,7 @@ def test_episodes_of_a_single_reading_are_not_said_to_be_like_one_another(tmp_pa
         record_run(tmp_path / "episodes" / f"episode_{number}", Run(seed=number, acts=False, seconds=0.01, cameras=()))
     done = run_here("datasets", "check", tmp_path, "--jobs", 1)
     assert done.returncode == 1
-    assert done.stderr.count("nothing can be checked: it has 1 readings of joints") == 2
+    assert done.stderr.count("nothing can be checked: it has 1 reading of joints") == 2
 
 
 @pytest.mark.usefixtures("fork_server")

@@ -141,7 +141,7 @@ def test_events_tell_each_difference_with_its_number_and_remedy(reference, tmp_p
     events = [json.loads(line) for line in done.stdout.splitlines()]
     (differs,) = [each for each in events if each["event"] == "difference"]
     assert (differs["name"], differs["verdict"]) == ("other_robot", "warn")
-    assert differs["limits"] == "[1 differences; warns from 1, fails from 2]"
+    assert differs["limits"] == "[1 difference; warns from 1, fails from 2]"
     assert differs["remedy"].startswith("Compare with a reference of this robot")
 
 

@@ -316,9 +316,10 @@ def _show(service: InferenceService, stopping: threading.Event) -> None:
 
 def _line(statistics: dict[str, Any]) -> str:
     return (
-        "{requests} requests, {answered} answered, {expired} expired, {malformed} malformed, {waiting} waiting | "
+        counted(statistics["requests"], "request")
+        + ", {answered} answered, {expired} expired, {malformed} malformed, {waiting} waiting | "
         "latency p50 {latency_p50_ms:.1f} ms, p99 {latency_p99_ms:.1f} ms | ".format_map(statistics)
-        + f"{counted(len(statistics['robots']), 'robot')}"
+        + counted(len(statistics["robots"]), "robot")
     )
 
 

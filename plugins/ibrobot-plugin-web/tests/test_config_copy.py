@@ -49,7 +49,7 @@ def copy(*arguments: str) -> Result:
 
 def test_the_copy_has_the_same_text_except_for_the_values_given(source: Path) -> None:
     ran = copy("--value", "MINI_PORT=/dev/zero")
-    assert ran.output.startswith("desk.yaml: ok (mini, 1 joints, hardware)\n")
+    assert ran.output.startswith("desk.yaml: ok (mini, 1 joint, hardware)\n")
     assert Path("desk.yaml").read_text() == source.read_text().replace("/dev/null", "/dev/zero")
 
 

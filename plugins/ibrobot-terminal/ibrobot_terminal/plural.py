@@ -11,3 +11,9 @@ def plural(number: int, noun: str) -> str:
 def counted(number: int, noun: str) -> str:
     """A number with what it counts: `1 episode`, `2 episodes`."""
     return f"{number} {plural(number, noun)}"
+
+
+def measured(value: float, unit: str) -> str:
+    """A value in three digits with its unit: `1 difference`, `2 differences`, `1 ms`, `0.5 rad/s`."""
+    shown = f"{value:.3g}"
+    return f"{shown} {unit[:-1] if shown == '1' and unit.isalpha() and unit.endswith('s') and len(unit) > 2 else unit}"

@@ -191,7 +191,7 @@ function showFaults() {
 // What a run has achieved.
 function results({ episode, episodes, successes }) {
   if (episode) return `${episode.saved}${episode.wanted ? ` of ${episode.wanted}` : ""} saved`;
-  return episodes ? `${successes} of ${episodes} episodes successful` : "";
+  return episodes ? `${successes} of ${episodes} episode${episodes === 1 ? "" : "s"} successful` : "";
 }
 
 // The page that launched the run, whose address this one has after #, goes on with what was recorded.

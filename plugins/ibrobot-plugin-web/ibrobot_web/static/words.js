@@ -11,7 +11,7 @@ const filled = Object.entries(table).filter(([text]) => text.includes("{}")).sor
 const known = new Map(Object.entries(table));
 const before = new Map(); // what was looked up
 const MOST = 2000;
-const ONE = /\b1 ((?:more |other |recorded )?[a-z]+)\b/g;
+const ONE = /\b1 ((?:more |other |recorded )?[a-z]{3,})\b/g;
 
 // A text in the language of the browser; what no table has stays as it is.
 export function words(text) {
