@@ -24,6 +24,8 @@ NEVER_ONE = {
     "plugins/ibrobot-plugin-feetech/ibrobot_feetech/commands/setup_motors.py": "servos",
     "plugins/ibrobot-plugin-mcap/ibrobot_mcap/commands/verify.py": "problems",
     "plugins/ibrobot-plugin-mujoco/ibrobot_mujoco/identification/identify.py": "joints",
+    "plugins/ibrobot-plugin-mcap/ibrobot_mcap/commands/export.py": "images",
+    "plugins/ibrobot-terminal/ibrobot_terminal/hand_moved.py": "pauses",
     "plugins/ibrobot-provenance/ibrobot_provenance/dataset_suite.py": "episodes",
     f"{_DIAGNOSE}/causes/data.py": "demonstrations",
     f"{_DIAGNOSE}/report.py": "changes",

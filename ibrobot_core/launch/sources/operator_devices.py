@@ -168,8 +168,8 @@ class OperatorDevices:
         )
 
     def help(self) -> str:
-        """The instructions of all devices."""
-        return "\n".join(filter(None, (each.device.help() for each in self._connected)))
+        """The instructions of all devices, once if two say the same."""
+        return "\n".join(dict.fromkeys(filter(None, (each.device.help() for each in self._connected))))
 
     def _braking_s(self, measured: JointReading, columns: NDArray[np.intp]) -> float:
         """Time that the joints need to stop from their present velocities, and one period [s]."""

@@ -174,8 +174,8 @@ def _has_begun(growing: GrowingEpisode, request: ConversionRequest) -> bool:
         with suppress(RecorderError):  # nothing is on the disk yet
             summary = growing.summary()
             contract = request.contract or recorded_contract(summary.metadata)
-            counted = {topic for topic, each in summary.topics.items() if each.count}
-            if contract is not None and counted.issuperset(contract.topics):
+            present = {topic for topic, each in summary.topics.items() if each.count}
+            if contract is not None and present.issuperset(contract.topics):
                 return not is_labelled(summary)
         growing.wait(time.monotonic() - begin_s)
     return False

@@ -11,6 +11,7 @@ import attrs
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import DatasetError
 from ibrobot_lerobot import layout
@@ -103,16 +104,16 @@ def _texts(dataset: layout.OnDisk, key: str) -> tuple[str, ...]:
 def _notes(dataset: layout.OnDisk) -> tuple[str, ...]:
     """What of a dataset is not as it should be, but can be read."""
     rows = list(dataset.episodes())
-    counted = {"total_episodes": len(rows), "total_frames": sum(row["length"] for row in rows)}
+    totals = {"total_episodes": len(rows), "total_frames": sum(row["length"] for row in rows)}
     notes = [
         f"{layout.INFO} says {name}: {dataset.info[name]}, its episodes have {count}"
-        for name, count in counted.items()
+        for name, count in totals.items()
         if dataset.info[name] != count
     ]
     tables = [path for path in dataset.tables() if path.exists()]
     stored = sum(pq.ParquetFile(path).metadata.num_rows for path in tables)
-    if stored != counted["total_frames"]:
-        notes.append(f"the tables have {stored} rows, the episodes {counted['total_frames']}")
+    if stored != totals["total_frames"]:
+        notes.append(f"the tables have {stored} rows, the episodes {totals['total_frames']}")
     for key in dataset.videos:
         wanted = {dataset.video(row, key) for row in rows}
         if missing := [path for path in sorted(wanted) if not is_content(path)]:

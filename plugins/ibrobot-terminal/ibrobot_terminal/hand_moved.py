@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from ibrobot_core.api import Context, Deadman, TeleopCommand, TeleopError, Vector, seconds
 from ibrobot_terminal.hand_moved_options import HandMovedOptions
 from ibrobot_terminal.held_keys import HeldKeys
-from ibrobot_terminal.plural import counted
 
 _LONGEST_STEP_S = 0.1
 """Longest time step of an approach, e.g. after a pause of the host [s]."""
@@ -124,7 +123,7 @@ class HandMoved:
             "toggle": f"press {key} to follow the {device}",
             "hold": f"hold {key} to follow the {device}{'' if self._held.exact else ' (known by its repeats)'}",
         }
-        pause = {"none": "", "toggle": f": {counted(key, 'pause')}", "hold": f": release {key} to pause"}
+        pause = {"none": "", "toggle": f": {key} pauses", "hold": f": release {key} to pause"}
         deadman, paused = self._options.deadman, self._setpoint is None
         return f"PAUSED: {start[deadman]}" if paused else f"following the {device}{pause[deadman]}"
 

@@ -132,6 +132,6 @@ def pixels_of(image: Image) -> np.ndarray[Any, Any]:
     if image.encoding == "mono8":
         return rows[:, : image.width]
     if image.encoding not in _TO_RGB:
-        raise RecorderError(f"{counted(image.encoding, 'image')} cannot be saved as PNG")
+        raise RecorderError(f"{image.encoding} images cannot be saved as PNG")
     order = _TO_RGB[image.encoding]
     return rows[:, : len(order) * image.width].reshape(image.height, image.width, len(order))[:, :, order]
