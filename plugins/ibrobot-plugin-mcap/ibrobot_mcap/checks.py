@@ -47,9 +47,9 @@ def problems_of(path: Path, longest_gap: float) -> list[str]:
     problems += [f"no message of {topic}, which is in its contract" for topic in absent]
     for topic, stated in reader.stated.items():
         known = summary.topics.get(topic)
-        found = (known.count if known is not None else 0) + repeated.get(topic, 0)
-        if stated != found:
-            problems.append(f"{topic}: {counted(found, 'message')}, {METADATA} says {stated}")
+        total = (known.count if known is not None else 0) + repeated.get(topic, 0)
+        if stated != total:
+            problems.append(f"{topic}: {counted(total, 'message')}, {METADATA} says {stated}")
     needed = _needed(contract) if contract is not None else {}
     span_ns = summary.start_ns, summary.end_ns
     for topic, known in summary.topics.items():

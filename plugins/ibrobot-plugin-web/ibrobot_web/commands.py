@@ -281,7 +281,7 @@ def _jog(session: RunView, sent: Sent[messages.Jog]) -> None:
     if jog.at > now_ms + _AHEAD_MS or jog.press > jog.at + _AHEAD_MS:
         raise IbrobotError("the page's time is wrong; press again")
     if now_ms - jog.at > _LATE_MS:
-        raise IbrobotError(f"the connection is too slow to jog: {(now_ms - jog.at) / 1e3:.1f} s")
+        raise IbrobotError(f"the connection is too slow to jog ({(now_ms - jog.at) / 1e3:.1f} s)")
     made_ns, began_ns = _run_times(session, jog.at, jog.press)
     session.bus.call(JOG, Jog(made_ns, began_ns, **{name: getattr(jog, name) for name in _MOTION}))
 

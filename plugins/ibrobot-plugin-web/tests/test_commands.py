@@ -207,7 +207,7 @@ def test_the_page_can_end_the_run(rig: Callable[..., Rig]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("age_ms", "why"), [(0, ""), (100, ""), (300, "the connection is too slow to jog: 0.3 s"), (-100, "time is wrong")]
+    ("age_ms", "why"), [(0, ""), (100, ""), (300, "the connection is too slow to jog (0.3 s)"), (-100, "time is wrong")]
 )
 def test_a_message_of_the_deadman_counts_while_it_is_young(rig: Callable[..., Rig], age_ms: int, why: str) -> None:
     taken: list[Any] = []

@@ -1,6 +1,6 @@
 // The page of a run: header, faults, pictures, recording, driving, and panels that fold away.
 
-import { h, refresh, row, say, switchTheme, table, toast } from "./dom.js";
+import { clearToasts, h, refresh, row, say, switchTheme, table, toast } from "./dom.js";
 import { Deadman } from "./hold.js";
 import { Drive, StopLine, Stream } from "./link.js";
 import { View3D } from "./view3d.js";
@@ -163,6 +163,7 @@ function showFaults() {
   const guard = status?.guard?.text ?? "";
   const unconfirmed = page.unconfirmed ?? "";
   refresh($("faults"), { ended, lost, unconfirmed, estop, faults, held, guard, failure, absent, conditions, operating: page.operating }, () => {
+    if (faults.length || estop) clearToasts(); // what they say is past, and on a phone they would cover the fault
     const reset = () => h("button", { onclick: () => page.drive.ask("reset"), disabled: !page.operating }, "Reset");
     return [
       unconfirmed ? h("div", { class: "fault alarm" }, h("strong", {}, "The robot may not have stopped: "), h("span", {},
