@@ -6,12 +6,13 @@ import json
 import logging
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Self
 
 import attrs
 import numpy as np
 
 from ibrobot_core.clock import Clock
+from ibrobot_core.component_config import ComponentConfig
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.control import commands
 from ibrobot_core.control.active import ActiveExecutors
@@ -23,10 +24,11 @@ from ibrobot_core.control.pose_motion import TIMEOUT_S, PoseMotion
 from ibrobot_core.control.readings import Readings
 from ibrobot_core.control.safety import SafetyLayer
 from ibrobot_core.control.timing import TOO_BUSY, Pace
-from ibrobot_core.errors import HardwareError, IbrobotError, NotSupported
-from ibrobot_core.interfaces import EpisodeSetup, Executor, Guard, JointReading, Signal, Torque
+from ibrobot_core.errors import ConfigError, HardwareError, IbrobotError, NotSupported, Problem
+from ibrobot_core.interfaces import Context, EpisodeSetup, Executor, Guard, JointReading, Signal, Torque
 from ibrobot_core.interfaces.executor import ExecutorGoal
 from ibrobot_core.interfaces.run_state import ControlState, PlanRecord
+from ibrobot_core.plugins import Registry
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import NS_PER_S, ns
 
@@ -114,6 +116,34 @@ class ControlCore:
         self._executors = ActiveExecutors(config.robot, executors, self.events.append, self._rest)
         self.state: ControlState | None = None
         """Readings and commands of the last tick; None before the first."""
+
+    @classmethod
+    def of(cls, config: RobotConfig, registry: Registry, clock: Clock, seed: int) -> Self:
+        """Build the control core of `config` without connecting any hardware.
+
+        Raises:
+            ConfigError: if the robot has neither hardware nor a simulation.
+            PluginError: if a plugin is missing.
+        """
+        simulation = config.simulation if config.simulated else None
+
+        def make(kind: str, component: ComponentConfig, name: str, joints: tuple[str, ...]) -> Any:
+            options = simulation.options if simulation is not None else None
+            context = Context.of(config, name, clock, seed, joints=joints, simulation=options)
+            return registry.create(kind, component.type, component.options, context)
+
+        executors = {name: make("executor", each, name, each.joints) for name, each in config.executors.items()}
+        if simulation is not None:
+            hardware = {"simulation": make("hardware", simulation, "simulation", config.robot.joint_names)}
+        elif config.hardware:
+            hardware = {name: make("hardware", each, name, each.joints) for name, each in config.hardware.items()}
+        else:
+            problem = "neither hardware nor simulation is there: nothing to control"
+            raise ConfigError([Problem(str(config.source), 0, "hardware", problem)])
+        named = config.control.guard
+        guard = None if named is None else make("guard", named, "guard", config.robot.joint_names)
+        group = HardwareGroup(config.robot, hardware, config.control.state_timeout)
+        return cls(config, group, executors, clock, guard)
 
     def start(self, mode: str) -> None:
         """Connect, hold the joints at their measured positions, and enter `mode` once `arrived`.

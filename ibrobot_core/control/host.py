@@ -18,7 +18,7 @@ from ibrobot_core.clock import RealClock, SteppedClock
 from ibrobot_core.component import raise_thread_priority
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.control import commands
-from ibrobot_core.control.build import build_core
+from ibrobot_core.control.core import ControlCore
 from ibrobot_core.control.link import LinkLayout, SharedMemory, raise_error
 from ibrobot_core.control.timing import REPORT_TICKS, TOO_BUSY, Punctuality
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError
@@ -132,7 +132,7 @@ class InlineControl(ControlHost):
         on_event: OnEvent,
     ) -> None:  # fmt: skip
         super().__init__(on_state, on_event)
-        self._core = build_core(config, registry, clock, seed)
+        self._core = ControlCore.of(config, registry, clock, seed)
         self._clock = clock
         self._mode = config.default_control_mode
         self._punctuality = Punctuality()

@@ -20,7 +20,6 @@ from ibrobot_core.channel import Channel
 from ibrobot_core.child import is_stopped, run_child
 from ibrobot_core.clock import RealClock
 from ibrobot_core.config import from_document
-from ibrobot_core.control.build import build_core
 from ibrobot_core.control.commands import Command, EmergencyStop, Halt, decode
 from ibrobot_core.control.core import ControlCore
 from ibrobot_core.control.link import LinkLayout, SharedMemory
@@ -172,7 +171,7 @@ def main() -> int:
     def run(channel: Channel, order: Mapping[str, Any], memory: int, wake: int) -> None:
         clock = RealClock(order["epoch_offset_ns"])
         config = from_document(order["document"], source=Path(order["source"]), sim=order["sim"])
-        core = build_core(config, installed_plugins(), clock, order["seed"])
+        core = ControlCore.of(config, installed_plugins(), clock, order["seed"])
         try:
             core.start(order["mode"])
             shared = SharedMemory(memory, LinkLayout(len(config.robot.joints), core.signal_size))

@@ -13,8 +13,7 @@ from ibrobot_core.contract.frames import FrameSampler
 from ibrobot_core.contract.specs import Contract
 from ibrobot_core.contract.vectors import PolicyVectors
 from ibrobot_core.dispatch.latency import LatencyEstimate
-from ibrobot_core.dispatch.resume import LeadIn
-from ibrobot_core.dispatch.smoother import TemporalSmoother
+from ibrobot_core.dispatch.smoother import LeadIn, TemporalSmoother
 from ibrobot_core.errors import ContractError
 from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient
 from ibrobot_core.interfaces import Frame, PolicySpec

@@ -1,10 +1,11 @@
-"""The temporal smoother: merges action chunks into one plan and blends them where they overlap in time."""
+"""The temporal smoother: merges action chunks into one plan, blends them, and leads into the first one."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 
+import attrs
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +14,8 @@ from ibrobot_core.robot import FARTHEST, Vector
 LONGEST_CHUNK = 1000
 """Largest number of actions in a chunk: a longer plan would occupy a control tick."""
 _FIRST_GAINS = 256
+_LEAD_SHARE = 0.5
+"""Fraction of the limits available to the lead-in; the rest is left to the chunk's own motion."""
 
 Lead = Callable[[Vector, Vector], Vector]
 
@@ -211,3 +214,43 @@ def _gains(ratio: float, size: int) -> Vector:
 def _first_beyond(actions: Vector) -> str:
     row, column = np.argwhere(~(np.abs(actions) <= FARTHEST))[0]
     return f"{actions[row, column]} in action {row}, element {column}"
+
+
+@attrs.frozen(eq=False)
+class LeadIn:
+    """Makes a chunk start at the held position, or on the previous plan.
+
+    Args:
+        step_s: time between actions [s].
+        max_velocity: of each joint [rad/s], shape (A,).
+        max_acceleration: of each joint [rad/s^2], shape (A,).
+    """
+
+    step_s: float
+    max_velocity: Vector
+    max_acceleration: Vector
+
+    def __call__(self, before: Vector, actions: Vector) -> Vector:
+        """Return the actions, shape (N, A), changed so that they continue from `before`.
+
+        The differences in position and speed are added to the actions and fade out along a cubic, which uses half of
+        the limits of the joint with the longest way. A chunk shorter than the cubic ends before it has faded out.
+
+        Args:
+            before: the commands without the new chunk: those at the first and second action, shape (2, A); or the
+                position at which the arm is held, shape (1, A).
+            actions: the new commands.
+        """
+        gap = before[0] - actions[0]
+        if not gap.any():
+            return actions  # they already continue from there
+        lag = before[-1] - before[0] - (actions[1 % len(actions)] - actions[0])
+        speed = np.abs(lag) / self.step_s
+        # Over a time T, the cubic from a distance has the peaks 1.5 / T and 6 / T^2, the one from a speed 1 and 4 / T.
+        limit = _LEAD_SHARE * self.max_acceleration
+        by_acceleration = (2 * speed + np.sqrt(4 * speed**2 + 6 * limit * np.abs(gap))) / limit
+        by_velocity = 1.5 * np.abs(gap) / (_LEAD_SHARE * self.max_velocity)
+        steps = math.ceil(max(by_velocity.max(), by_acceleration.max()) / self.step_s)
+        s = np.minimum(np.arange(len(actions)) / steps, 1.0)[:, None]
+        result: Vector = actions + (1 - s**2 * (3 - 2 * s)) * gap + steps * s * (1 - s) ** 2 * lag
+        return result

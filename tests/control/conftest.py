@@ -15,7 +15,6 @@ from ibrobot_testing.fakes import FakeHardware, FakeRealHardware, FakeTrajectory
 
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.config import RobotConfig, from_document
-from ibrobot_core.control.build import build_core
 from ibrobot_core.control.commands import Command
 from ibrobot_core.control.core import ControlCore
 from ibrobot_core.descriptors import ExecutorDescriptor, HardwareDescriptor
@@ -138,7 +137,7 @@ class Rig:
         registry = self._registry()
         registry.entries.update({(entry.kind, entry.descriptor.type): entry for entry in entries})
         self.config: RobotConfig = from_document(document, source=Path("mini.yaml"), sim=sim, registry=registry)
-        self.core: ControlCore = build_core(self.config, registry, self.clock, 0)
+        self.core: ControlCore = ControlCore.of(self.config, registry, self.clock, 0)
 
     def _registry(self) -> Registry:
         def scripted(options: object, ctx: Context) -> ScriptedHardware:

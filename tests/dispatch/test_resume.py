@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ibrobot_core.dispatch.resume import LeadIn
+from ibrobot_core.dispatch.smoother import LeadIn
 
 STEP_S = 1 / 30
 VELOCITY, ACCELERATION = np.array([3.0, 1.0]), np.array([40.0, 5.0])

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ibrobot_core.dispatch.resume import LeadIn
-from ibrobot_core.dispatch.smoother import TemporalSmoother
+from ibrobot_core.dispatch.smoother import LeadIn, TemporalSmoother
 
 STEP = 33_333_333
 T0 = 1_700_000_000_000_000_000

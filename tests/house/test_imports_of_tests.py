@@ -18,7 +18,7 @@ ALLOWED = {
         "ibrobot_core.contract.image",
     ): "every encoding that contracts know",
     ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.config"): DRIVE,
-    ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.control.build"): DRIVE,
+    ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.control.core"): DRIVE,
     ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.control.commands"): DRIVE,
     ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.interfaces.run_state"): DRIVE,
     ("ibrobot-plugin-lerobot-devices/tests/driving.py", "ibrobot_core.plugins"): DRIVE,

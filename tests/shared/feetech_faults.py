@@ -40,8 +40,8 @@ from numpy.typing import NDArray
 
 from ibrobot_core.clock import SteppedClock
 from ibrobot_core.config import RobotConfig, from_document
-from ibrobot_core.control.build import build_core
 from ibrobot_core.control.commands import ClearFaults, RaiseFault
+from ibrobot_core.control.core import ControlCore
 from ibrobot_core.errors import TeleopError
 from ibrobot_core.interfaces import Context, JointReading, Teleop
 from ibrobot_core.interfaces.run_state import PlanRecord
@@ -170,7 +170,7 @@ class Bench:
         self.keys: queue.SimpleQueue[str] = queue.SimpleQueue()
         self.chance = np.random.default_rng(seed)
         self.said = Said()
-        self.core = build_core(config, installed_plugins(), clock, seed)
+        self.core = ControlCore.of(config, installed_plugins(), clock, seed)
         self._max_lead = config.robot.max_lead
         component = config.teleoperation["leader"]
         ctx = Context("leader", clock, logging.getLogger("ibrobot.leader"), config.robot, keys=lambda: self.keys)

@@ -33,8 +33,8 @@ from ibrobot_core.api import (
 )
 from ibrobot_core.app import ComponentFailed
 from ibrobot_core.config import from_document
-from ibrobot_core.control.build import build_core
 from ibrobot_core.control.commands import ClearFaults, EmergencyStop
+from ibrobot_core.control.core import ControlCore
 from ibrobot_core.interfaces.run_state import PlanRecord
 from ibrobot_core.plugins import Entry, Registry, discover
 
@@ -309,7 +309,7 @@ class Drive:
         )
         document = yaml.safe_load(DOCUMENT) | dict(sections or {})
         config = from_document(document, source=Path("wheels.yaml"), sim=False, registry=registry)
-        self.core = build_core(config, registry, world.clock, 0)
+        self.core = ControlCore.of(config, registry, world.clock, 0)
         self.robot = config.robot
         self.ctx = host_context("cmd_vel", robot=config.robot, clock=world.clock)
         self.teleop = CmdVelTeleop(CmdVelOptions(), self.ctx)
