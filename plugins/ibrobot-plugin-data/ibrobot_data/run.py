@@ -197,11 +197,6 @@ def check_out(request: ConversionRequest) -> None:
         pass
 
 
-def plan_conversion(request: ConversionRequest, episodes: Sequence[Path]) -> tuple[str, ...]:
-    """The sources of the episodes that a conversion into a new dataset would convert, by their summaries."""
-    return _Plan(request, request.out / STAGING, None, episodes).todo
-
-
 def _merge(
     request: ConversionRequest, old: DatasetSummary | None, units: Sequence[Unit], failed: Sequence[str]
 ) -> None:
