@@ -666,6 +666,18 @@ def test_check_of_a_dataset_names_a_cause_with_a_mistake(monkeypatch, data):
     assert lines[-1] == "Nothing was found in 2 episodes."
 
 
+@pytest.mark.parametrize(
+    ("episodes", "warned"), [(1, "Only 1 episode to"), (4, "Only 4 episodes to"), (5, ""), (90, "")]
+)
+def test_what_few_episodes_say_of_one_another_is_called_little(episodes: int, warned: str) -> None:
+    listed = [{"episode": "a", "causes": [{"name": "jerk", "text": "It jerks."}]}]
+    checked = {"episodes": episodes, "listed": listed, "counts": {"jerk": 1}, "unreadable": [], "untested": []}
+    first, *more, last = check.lines_of(checked)
+    assert first == "a: It jerks."
+    assert [each.startswith(warned) for each in more] == [True] * bool(warned)
+    assert last.startswith("1 of ")
+
+
 def test_consequence_of_the_first_cause_says_to_fix_that_first(data):
     run = Run(seed=9400, outcome="failure", guarded=(0.1, 0.9), **NONE, **JOINTS["gripper_reversed"][2])
     window = window_of(run)

@@ -26,6 +26,8 @@ from ibrobot_diagnose.window import Window
 
 _PARTS = 5
 """The episodes of a part are compared with the ones of the other parts."""
+_ENOUGH = 5
+"""So many episodes show what is usual among them."""
 _MOST = 4
 """Pictures of an episode in the report."""
 
@@ -215,4 +217,6 @@ def lines_of(checked: Mapping[str, Any]) -> list[str]:
         more = f" Also: {', '.join(other['name'] for other in others)}." if others else ""
         lines.append(f"{each['episode']}: {first['text']}{more}")
     names = ", ".join(f"{name} {count}" for name, count in checked["counts"].items())
+    if of < _ENOUGH:
+        untested.append(f"Only {counted(of, 'episode')} to compare: look at them yourself, and check again with more.")
     return [*lines, *untested, f"{len(listed)} of {counted(of, 'episode')} to look at: {names}{rest}"]

@@ -756,6 +756,7 @@ export default {
   "undecided between {} and {}": "{} 与 {} 之间尚无定论",
   "more than 100,000 episodes would decide": "要超过 100,000 个回合才有定论",
   "about {} more episodes of each would decide": "每个大约再评测 {} 个回合才有定论",
+  "Only {} episodes to compare: look at them yourself, and check again with more.": "只有 {} 个回合可供比较：请自己查看，有更多回合后再检查一次。",
   "Nothing was found in {} episodes": "在 {} 个回合中没有发现问题",
   "{} of {} episodes could not be read": "{} / {} 个回合无法读取",
   "{} of {} episodes could not be read.": "{} / {} 个回合无法读取。",
