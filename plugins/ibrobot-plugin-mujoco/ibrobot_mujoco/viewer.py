@@ -37,7 +37,10 @@ class MujocoViewer(Viewer):
             # Check first, because MuJoCo's viewer would wait for its window forever.
             if not glfw.init():
                 why = "; ".join(str(reason.message) for reason in reasons)
-                raise IbrobotError(f"no display for the viewer's window, see DISPLAY and WAYLAND_DISPLAY: {why}")
+                raise IbrobotError(
+                    f"no display for the viewer's window, see DISPLAY and WAYLAND_DISPLAY: {why}; run without --window, "
+                    "or with --web, which shows the robot in a browser"
+                )
         self._drawn = drawn = DrawnWorld.of(simulation, self._ctx.robot)
         others = set(threading.enumerate())
         self._window = viewer.launch_passive(drawn.model, drawn.data, show_left_ui=False, show_right_ui=False)

@@ -108,6 +108,7 @@ class Emulate:
             raise RequestError(f"--port {self.port}: {error}; choose another") from None
         with sensor:
             echo(f"127.0.0.1:{sensor.port}")
+            echo("Ctrl-C ends it", err=True)
             while not ended.wait(1 / self.rate):
                 force = self.force * math.sin(2 * math.pi * time.monotonic())
                 sensor.measure((0, 0, round(1e6 * force), 0, 0, 0))

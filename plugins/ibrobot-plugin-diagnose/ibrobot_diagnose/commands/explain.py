@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import attrs
 from ibrobot_provenance.jobs import Job, open_pool
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.app import Emit, RequestError, Unsuccessful, echo, wrong_input
 from ibrobot_diagnose.options import ExplainOptions, Progress, Report
@@ -109,7 +110,7 @@ def explain_episode(
         write_report(folder_of(options, episode), explanation, episode)
     lines = explanation.lines()
     if card is not None and options.against is not None:
-        runs = "1 run" if card.episodes == 1 else f"{card.episodes} runs"
+        runs = counted(card.episodes, "run")
         lines.append(f"“The data” stands here for what it is compared with: {runs} of {options.against}.")
     return {**explanation.facts(ticks=options.ticks), "lines": lines}
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import attrs
 from ibrobot_calibration import Calibration, JointCalibration, calibration_path, load_calibration
+from ibrobot_terminal.plural import counted
 
 from ibrobot_core.api import option
 from ibrobot_core.app import RequestError, echo, on_signals
@@ -128,7 +129,7 @@ class Emulate:
                 arm.start()
                 stack.callback(arm.stop)
             _hurry()
-            echo(f"{count} servo{'s' if count > 1 else ''} at {self.baud} baud; Ctrl-C ends it", err=True)
+            echo(f"{counted(count, 'servo')} at {self.baud} baud; Ctrl-C ends it", err=True)
             hand = Hand(emulator, self.swing) if self.swing else None
             _wait(ended, arm, hand)
 
