@@ -38,8 +38,8 @@ class MujocoViewer(Viewer):
             if not glfw.init():
                 why = "; ".join(str(reason.message) for reason in reasons)
                 raise IbrobotError(
-                    f"no display for the viewer's window, see DISPLAY and WAYLAND_DISPLAY: {why}; run without --window, or "
-                    "with --web, which shows the robot in a browser"
+                    f"no display for the viewer's window, see DISPLAY and WAYLAND_DISPLAY: {why}; run without "
+                    "--window, or with --web, which shows the robot in a browser"
                 )
         self._drawn = drawn = DrawnWorld.of(simulation, self._ctx.robot)
         others = set(threading.enumerate())
