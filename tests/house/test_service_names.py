@@ -6,6 +6,7 @@ import ast
 import re
 from collections.abc import Collection, Iterator
 from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,8 @@ CALLS = {"call", "serves", "unserve", "ask"}
 
 def named(text: str, known: Collection[str]) -> Iterator[tuple[int, str]]:
     """Line and text of each literal that is called as a service, begins as one, or resembles one."""
+    if not re.search(r"""["'}]/[a-z_]""", text):  # what begins a literal or goes on in one
+        return
     first_words = {name.split("/")[1] for name in known if name.count("/") > 1}
     tree = ast.parse(text)
     called = {
@@ -29,6 +32,7 @@ def named(text: str, known: Collection[str]) -> Iterator[tuple[int, str]]:
         for node in ast.walk(tree)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in CALLS and node.args
     }
+    close = cache(lambda name: bool(get_close_matches(name, known, 1, 0.85)))
     for node in ast.walk(tree):
         if not isinstance(node, ast.Constant) or not isinstance(name := node.value, str):
             continue
@@ -36,7 +40,7 @@ def named(text: str, known: Collection[str]) -> Iterator[tuple[int, str]]:
             continue
         words = name.split("/")
         begins = len(words) > 2 and words[1] in first_words
-        if id(node) in called or begins or get_close_matches(name, known, 1, 0.85):
+        if id(node) in called or begins or close(name):
             yield node.lineno, name
 
 

@@ -249,7 +249,7 @@ JSON = {
     "replay BAD --json": 2,
     "convert EPISODE --out new --jobs 1 --json": 0,
     "convert BAD --out new --json": 2,
-    "eval so101_pick_cube --mode scripted --episodes 1 --out new --jobs 1 --json": 0,
+    "eval so101_pick_cube --mode scripted --set contract.max_duration_s=0.5 --episodes 1 --out new --json": 0,
     "eval BAD --out new --json": 2,
     "config check so101 --json": 0,
     "config check BAD --json": 2,
