@@ -546,8 +546,7 @@ def discover(points: Iterable[EntryPoint] | None = None) -> Registry:
     installed = [entry for entry in entry_points() if entry.group.partition(".")[0] == ENTRY_POINT_GROUP]
     own = [entry for entry in installed if entry.dist is not None and entry.dist.name == CORE]
     if not own:
-        message = f"the installed {CORE} has no plugin of its own: install it again, in a clone with `uv sync`"
-        raise PluginError(message)
+        raise PluginError(f"the installed {CORE} has no plugin of its own: install it again, in a clone with `uv sync`")
     others = [entry for entry in (installed if points is None else points) if entry not in own]
     registry = Registry()
     plugins = [_Plugin.of(entry) for entry in (*own, *sorted(others, key=lambda entry: entry.name))]
@@ -561,10 +560,11 @@ def discover(points: Iterable[EntryPoint] | None = None) -> Registry:
 def installed_plugins() -> Registry:
     """The registry of the installed plugins, discovered once per process."""
     collects = gc.isenabled()
-    gc.disable()  # what imports make stays: to look for garbage in it takes a sixth of the time
+    gc.disable()  # what imports make stays: no garbage is looked for in it, now, later, or when Python ends
     try:
         return discover()
     finally:
+        gc.freeze()
         if collects:
             gc.enable()
 
