@@ -224,6 +224,9 @@ def test_a_held_button_moves_a_joint_and_leaving_the_page_stops_it(tab: Tab) -> 
     assert tab.ask("ibrobot.deadman.held") is False
 
 
+WARNED = """async () => (await import("/static/dom.js")).toast("the connection is too slow to jog", "error")"""
+
+
 def test_escape_stops_the_robot_whatever_the_page_shows_and_wherever_the_focus_is(tab: Tab) -> None:
     assert tab.text("#stop") == "STOP Esc"
     for place in ("#view canvas", ".joint input", "#prompt", "dialog button", "mode"):
@@ -239,9 +242,12 @@ def test_escape_stops_the_robot_whatever_the_page_shows_and_wherever_the_focus_i
             )
         if place != "mode":
             tab.page.locator(place).first.focus()
+        tab.page.evaluate(WARNED)
+        assert "too slow" in tab.text(".toasts")
         tab.page.keyboard.press("Escape")
         tab.until(lambda: tab.ask("ibrobot.state.estop && ibrobot.status.faults.length > 0"))
         assert "emergency stop" in tab.text("#faults")
+        assert "too slow" not in tab.text(".toasts"), "a message that is past does not cover the fault on a phone"
         tab.ask("document.getElementById('dialog').close()")
         tab.page.locator("#faults button").first.click()
         tab.until(lambda: tab.ask("!ibrobot.state.estop"))
