@@ -305,11 +305,11 @@ def check_wheels(session: nox.Session, folder: Path) -> None:
         fresh = (f"--refresh-package={name}" for name in LOCAL)
         wheels = ("--find-links", str(folder / "dist"), "-c", "constraints.txt", *fresh)
         session.run("uv", "pip", "install", "--quiet", "--python", str(environment), *wheels, requirement)
-        complete = system_libraries(session, str(environment / "bin/python"))
+        lacks = system_libraries(session, str(environment / "bin/python"))
         with session.chdir(folder):  # away from this repository
             for command in commands:
                 program, *arguments = shlex.split(command, comments=True)
-                if arguments[:1] == ["record"] and not complete:  # a recording needs its cameras
+                if arguments[:1] == ["record"] and lacks:  # a recording needs its cameras
                     continue
                 run_again(session, str(environment / "bin" / program), *arguments)
     emulated = Path("tests/house/launch_on_emulators.py").absolute()
@@ -376,7 +376,8 @@ def release(session: nox.Session) -> None:
 def plugin(session: nox.Session, name: str) -> None:
     """A plugin's tests with that plugin and core alone; those in a browser run in `integration`."""
     install(session, name, groups=("test", "coverage"))
-    system_libraries(session)
+    if "guard" in system_libraries(session):  # planners and guards are all that its package is
+        skip_without_libraries(session)
     # A report without a threshold shows code that the package's own tests do not reach. It takes half as long again.
     measured = (f"--cov=ibrobot_{name.replace('-', '_')}", "--cov-report=term:skip-covered") if NAMED else ()
     chosen = () if NAMED else ("-m", "not long")
