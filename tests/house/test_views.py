@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -45,8 +45,10 @@ MOVES = {
 """View -> what it adds to `RunView`."""
 
 
-def imported() -> Iterator[tuple[str, set[str]]]:
+@cache
+def imported() -> list[tuple[str, set[str]]]:
     """Each file of the plugins, with the names that it imports from `ibrobot_core.app`."""
+    found = []
     for path in PLUGINS.glob("*/*ibrobot*/**/*.py"):
         names = {
             name.name
@@ -54,7 +56,8 @@ def imported() -> Iterator[tuple[str, set[str]]]:
             if isinstance(node, ast.ImportFrom) and node.module == "ibrobot_core.app"
             for name in node.names
         }
-        yield path.relative_to(PLUGINS).as_posix().partition("/")[2], names
+        found.append((path.relative_to(PLUGINS).as_posix().partition("/")[2], names))
+    return found
 
 
 def members(view: str) -> set[str]:

@@ -139,6 +139,10 @@ def compared(now: Rig, then: Rig) -> Diagnosis:
 
 def verdicts(now: Rig, then: Rig) -> dict[str, str]:
     """Cause -> verdict, of those that are not well."""
-    diagnosis = compared(now, then)
+    return unwell(compared(now, then))
+
+
+def unwell(diagnosis: Diagnosis) -> dict[str, str]:
+    """Cause -> verdict, of those that are not well."""
     listed = (*diagnosis.findings, *diagnosis.measured)
     return {each.name: each.evidence.verdict for each in listed if each.evidence.verdict != "ok"}

@@ -438,7 +438,7 @@ def oddity(rng: np.random.Generator, rig: Rig) -> str:
     return str(kind)
 
 
-@pytest.mark.parametrize("seed", range(24))
+@pytest.mark.parametrize("seed", [*range(12), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(12, 24))])
 def test_odd_arm_is_measured_right_or_refused(rig, seed):
     """Siblings of the oddities above: whatever is odd, no range is wrong, and no torque above the stated one."""
     kind, before = oddity(np.random.default_rng(seed), rig), rig.registers()
