@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from ibrobot_ros2.codec import decode, encode
+from ibrobot_ros2.offers import CLOCK
 from ibrobot_testing.command import command_line
 from ibrobot_zenoh.commands import network as network_module
-from ibrobot_zenoh.commands.bag import CLOCK, Player, choose, commands
+from ibrobot_zenoh.commands.bag import Player, choose, commands
 from ibrobot_zenoh.options import ZenohOptions
 from ibrobot_zenoh.transport import ZenohTransport
 
