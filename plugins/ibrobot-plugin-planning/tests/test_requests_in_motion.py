@@ -285,11 +285,12 @@ ONE = st.sampled_from(list(REQUESTS)).flatmap(
 )
 
 
-def test_no_request_ends_a_run(run: Run, caplog: pytest.LogCaptureFixture):
+@pytest.mark.parametrize("examples", [100, pytest.param(400, marks=pytest.mark.long)])
+def test_no_request_ends_a_run(run: Run, caplog: pytest.LogCaptureFixture, examples: int):
     runtime = run()
     bus, commands = runtime.session.bus, [command(runtime)]
 
-    @settings(max_examples=400, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
     @given(asked=ONE, away=st.booleans())
     def check(asked: tuple[Service[Any, Any] | str, Any], away: bool) -> None:
         caplog.clear()
