@@ -171,6 +171,17 @@ def test_a_server_that_is_stopped_ends_the_run(monkeypatch: pytest.MonkeyPatch) 
         viewer.close()
 
 
+def test_a_server_that_dies_ends_the_run() -> None:
+    viewer = WebViewer(OPTIONS, make_context())
+    viewer.open()
+    assert viewer._child is not None
+    try:
+        viewer._child.kill()
+        assert updated_until_it_fails(viewer) == "the page's server died: killed by SIGKILL"
+    finally:
+        viewer.close()
+
+
 def test_invalid_messages_of_the_server_are_dropped_and_an_error_while_receiving_ends_the_run(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
