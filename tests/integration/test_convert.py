@@ -21,6 +21,7 @@ from command_line import run_here
 from ibrobot_data.run import STAGING
 from ibrobot_provenance.ownership import Ownership
 from ibrobot_ros2 import encode
+from ibrobot_testing.site import made_up_site
 from ibrobot_testing.terminal import Terminal
 from recordings import CONTRACT, JOINTS, SIZE, START_NS, numbered, record
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
@@ -55,6 +56,7 @@ sys.stderr = Stuck(sys.stderr)
 """
 """Python source: whoever waits for what is `said` finds the program there, and not further on."""
 LAMP = "lamp_msgs/msg/Lamp"
+PLUGINS = Path(__file__).parents[1] / "shared/plugins"
 CALIBRATION = {
     joint: {"id": i + 1, "drive_mode": 0, "homing_offset": 0, "range_min": 1048, "range_max": 3048}
     for i, joint in enumerate(JOINTS)
@@ -364,12 +366,23 @@ def test_joints_in_lerobots_units(bags: Path, tmp_path: Path) -> None:
     assert "or --calibration" in without.err
 
 
-def test_joints_in_the_units_of_a_plugin(bags: Path, tmp_path: Path) -> None:
-    result = run(bags, "--out", tmp_path / "named", "--norm-mode", "radians", "--units", "calibrated")
-    assert result.code == 0, result.err
-    assert json.loads((tmp_path / "named/meta/ibrobot.json").read_bytes())["conversion"]["units"] == "calibrated"
-    other = run(bags, "--out", tmp_path / "named", "--append")
-    assert "was made with other settings: units calibrated, now None" in other.err
+def test_joints_in_the_units_of_a_plugin(bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run(bags, "--out", tmp_path / "radians").code == 0
+    with made_up_site(tmp_path / "site", PLUGINS, monkeypatch) as site:
+        site.add("other-units", "other_units.py")
+        degrees = ("--norm-mode", "degrees", "--units", "other_units")
+        for out, given in (("named", degrees), ("none", degrees[:2])):  # in new processes, which have the plugin
+            command = [sys.executable, "-c", PROGRAM, "convert", str(bags), "--out", str(tmp_path / out), *given]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            assert (done.returncode == 0) == (out == "named"), done.stderr
+        assert "name the type of the units: several" in done.stderr
+    for key in ("observation.state", "action"):  # this plugin takes all numbers for angles
+        np.testing.assert_allclose(
+            rows(tmp_path / "named")[key], np.degrees(rows(tmp_path / "radians")[key]), rtol=1e-6
+        )
+    assert json.loads((tmp_path / "named/meta/ibrobot.json").read_bytes())["conversion"]["units"] == "other_units"
+    other = run(bags, "--out", tmp_path / "named", "--append", *degrees[:2])
+    assert "was made with other settings: units other_units, now None" in other.err
     unknown = run(bags, "--out", tmp_path / "none", "--units", "calibrate")
     assert unknown.code != 0
     assert "unknown units type 'calibrate', did you mean 'calibrated'?" in unknown.err
