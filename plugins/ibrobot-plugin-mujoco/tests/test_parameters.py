@@ -139,6 +139,15 @@ def test_soft_servo_sags_and_delay_is_kept(tmp_path: Path) -> None:
     np.testing.assert_allclose(late.measured[60:, 4], prompt.measured[55:-5, 4], atol=1e-3)
 
 
+def test_loaded_joint_at_rest_is_held_by_its_dry_friction(tmp_path: Path) -> None:
+    """A command that asks for a third of the dry friction hardly moves a joint; it could move it by 0.03 rad."""
+    arm = planted(every={"frictionloss": 0.9, "kp": 10.0})
+    commands = np.tile(ROBOT.pose("home"), (300, 1))
+    commands[100:, [0, 4]] += 0.03
+    measured = recorded(simulated(arm, tmp_path), commands, encoder=0).measured[:, [0, 4]]
+    assert np.abs(measured[-1] - measured[100]).max() < 0.008
+
+
 def test_backlash_is_lost_motion() -> None:
     there_and_back = np.concatenate([np.linspace(0, 0.3, 50), np.linspace(0.3, 0, 50)])[:, None]
     moved = with_backlash(there_and_back, np.array([0.1]))
