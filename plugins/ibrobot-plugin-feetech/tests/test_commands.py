@@ -146,7 +146,7 @@ def test_an_arm_is_calibrated_in_the_dialogue_and_the_former_file_is_kept(emulat
     (kept,) = (path for path in home.glob("so101_follower.2*.json") if "meta" not in path.name)
     assert kept.read_text() == before
     _, screen = ran("check", emulator.port)
-    assert "match the calibration" in screen
+    assert "6 servos as in the calibration" in screen
     assert "0 rad is the pose that was set by hand" in screen
     code, screen = ran("check", emulator.port, "--write", "--yes", before=adapter.replace("5A12", "5A99"))
     assert code == 1
@@ -450,9 +450,7 @@ def test_arms_of_any_size_and_with_numbers_as_names_are_imported_and_used(home, 
     joints = list(document) if numbers else [f"joint{n}" for n in document]
     robot = arm_of(tmp_path, joints)
     if size > len(JOINTS):
-        with pytest.raises(
-            CalibrationError, match=f"the file has {size} joints, the arm 6: give the robot YAML of its"
-        ):
+        with pytest.raises(CalibrationError, match=f"the file has {size} joints, the arm 6: name the YAML of its arm"):
             CliRunner().invoke(feetech, ["import", str(file), "--name", "mine"], catch_exceptions=False)
         assert not list(home.rglob("mine*"))
     done = CliRunner().invoke(feetech, ["import", str(file), "--name", "mine", "--robot", str(robot)])
