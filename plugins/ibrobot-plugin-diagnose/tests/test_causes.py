@@ -20,6 +20,7 @@ from ibrobot_diagnose.card import make_card
 from ibrobot_diagnose.cause import KIND, OWN_NAMES, Cause, CauseDescriptor, Evidence, Reference
 from ibrobot_diagnose.causes import all_causes
 from ibrobot_diagnose.causes.data import UnseenStates
+from ibrobot_diagnose.causes.joints import like_poses
 from ibrobot_diagnose.causes.motion import AnswersTremble, SmoothingAverages
 from ibrobot_diagnose.causes.others import TOOLS
 from ibrobot_diagnose.causes.pictures import pairs
@@ -738,3 +739,14 @@ def test_arm_that_stays_where_the_data_never_was_has_no_shifted_zero(data, pose,
 
     run = window_of(Run(seed=9501, outcome="failure", answered=stays, **{**ONE, "seconds": 8}))
     assert "joint_zero" not in names_of(run, data)
+
+
+def test_pose_in_which_a_run_began_is_known_if_the_camera_began_first(data):
+    """It speaks against a shifted zero."""
+    run = window_of(Run(seed=9502, acts=False, **ONE))
+    (camera,) = run.cameras.values()
+    late = run.state.times_ns > camera.times_ns[1]
+    kept = {name: getattr(run.state, name)[late] for name in ("times_ns", "stamps_ns", "values")}
+    state = attrs.evolve(run.state, **kept)
+    poses = like_poses(attrs.evolve(run, state=state), data.card)
+    np.testing.assert_array_equal(poses.own[poses.begins], state.at(np.array(camera.times_ns)[2:3]))

@@ -74,7 +74,7 @@ class LikePoses:
 
 
 def like_poses(window: Window, card: Card) -> LikePoses:
-    """Poses at pictures that look the same, each a step away from the others, in the window and in the data.
+    """Poses at pictures that look the same, each a step from the camera's others, in the window and in the data.
 
     An arm that stands still or trembles where the data never was, and so resembles one other pose of the data, says no
     more than one that passes it.
@@ -92,14 +92,16 @@ def like_poses(window: Window, card: Card) -> LikePoses:
         distance, near = nearest(descriptors(pair.camera.small[index]), pair.card.vectors)
         states, data = window.state.at(times[index]), pair.card.poses[near]
         alike = 1.0 - distance / max(_LIKE * pair.card.usual_distance, 1e-6)
+        known = np.isfinite(states).all(axis=1)
+        begin = int(known.argmax())  # the first pictures may come before the first reading
         kept: list[int] = []
-        for i in (0, *(np.argsort(-alike[1:]) + 1).tolist()):
-            if alike[i] > 0 and np.isfinite(states[i]).all() and _away(states, i, kept) and _away(data, i, kept):
+        for i in (begin, *np.argsort(-alike).tolist()):
+            if alike[i] > 0 and known[i] and _away(states, i, kept) and _away(data, i, kept):
                 kept.append(i)
         own.append(states[kept])
         theirs.append(data[kept])
         weights.append(np.square(alike[kept], dtype=np.float64))
-        begins.append(np.array(kept) == 0)
+        begins.append(np.array(kept) == begin)
     return LikePoses(np.concatenate(own), np.concatenate(theirs), np.concatenate(weights), np.concatenate(begins))
 
 
