@@ -34,7 +34,7 @@ _Mesh = mujoco.mjtGeom.mjGEOM_MESH
 _Box = mujoco.mjtGeom.mjGEOM_BOX
 _HOLDS = [0.97, 0.97, 0.001, 0.5, 2.0]
 """`solimp` of dry friction. With MuJoCo's own, 0.9, a loaded joint at rest creeps by a degree in seconds, where the
-gears of a servo hold; so it creeps a quarter as fast. From 0.99, a fit takes backlash for friction."""
+gears of a servo hold; so it creeps less than a third as fast. From 0.99, a fit takes backlash for friction."""
 _SHAPES = {"box": _Box, "sphere": mujoco.mjtGeom.mjGEOM_SPHERE, "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER}
 
 
