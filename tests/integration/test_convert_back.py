@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import pytest
 from command_line import run_here
 from ibrobot_lerobot.layout import open_dataset
 from ibrobot_lerobot.rows import EpisodeRows
+from ibrobot_testing.site import made_up_site
 from recordings import CONTRACT, JOINTS, START_NS, record
 
 from ibrobot_core.contract.specs import Contract
@@ -23,6 +25,7 @@ from ibrobot_core.plugins import installed_plugins
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("first_conversion")]
 
+PLUGINS = Path(__file__).parents[1] / "shared/plugins"
 CALIBRATION = {
     joint: {"id": i + 1, "drive_mode": i % 2, "homing_offset": 0, "range_min": 1000, "range_max": 3000}
     for i, joint in enumerate(JOINTS)
@@ -126,6 +129,26 @@ def test_joints_in_other_units_come_back_in_radians(
     for one, other in zip(rows(exact, 0), rows(tmp_path / "again", 0), strict=True):
         for key in ("observation.state", "action"):
             np.testing.assert_allclose(other[key], one[key], atol=1e-5)
+
+
+def test_joints_in_the_units_of_a_plugin_come_back_by_it_or_not_at_all(
+    exact: Path, convert: Convert, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Its degrees are not LeRobot's: by the calibration, all would come back elsewhere, in silence."""
+    shutil.copytree(exact, tmp_path / "units")
+    note = tmp_path / "units/meta/ibrobot.json"
+    kept = json.loads(note.read_bytes())
+    kept["conversion"] |= {"norm_mode": "degrees", "units": "other_units"}
+    note.write_text(json.dumps(kept))
+    done = convert(tmp_path / "units:0", "--to", "bag", "--out", tmp_path / "back")
+    assert done.returncode == 1
+    assert "unknown units type 'other_units'" in done.stderr
+    with made_up_site(tmp_path / "site", PLUGINS, monkeypatch) as site:
+        site.add("other-units", "other_units.py")
+        with closing(installed_plugins().open_episode(tmp_path / "units:0")) as reader:
+            read = [each.message for each in reader.messages(["/joint_states"])]
+    stated = np.array([row["observation.state"] for row in rows(exact, 0)])
+    np.testing.assert_allclose([each.position for each in read], np.radians(stated), rtol=1e-6)
 
 
 def test_pictures_of_videos_come_back_in_step(bags: Path, exact: Path, convert: Convert, tmp_path: Path):

@@ -13,7 +13,7 @@ from typing import Any, override
 
 import attrs
 import numpy as np
-from ibrobot_calibration.joint_units import JointUnits
+from ibrobot_calibration.joint_units import JointUnits, recorded_units
 from ibrobot_provenance.datasets import with_pinholes
 from ibrobot_provenance.robot_metadata import robot_metadata
 from ibrobot_terminal.plural import counted
@@ -51,6 +51,7 @@ class LeRobotReader(EpisodeReader):
         RecorderError: if it cannot be read, or the address has no episode number.
         ContractError: if the dataset's features do not match the contract.
         CalibrationError: if the unit of the joints needs a calibration that is missing.
+        PluginError: if the type of its units is not installed.
     """
 
     sampled = True
@@ -70,7 +71,8 @@ class LeRobotReader(EpisodeReader):
         self._origin = origin = episode_origin(root, dataset.metadata, address.number, address.given)
         self._contract = origin.contract
         _check_features(root, dataset.features, origin)
-        self._units = JointUnits(origin.norm_mode, origin.contract, origin.calibration, origin.document)
+        unit = origin.norm_mode, origin.contract, origin.calibration, origin.document
+        self._units = JointUnits(*unit) if origin.units is None else recorded_units(origin.units, *unit)
         self._composer = Composer(origin.contract)
         self._step_ns = round(NS_PER_S / dataset.info["fps"])
         start_ns = origin.start_ns
@@ -186,6 +188,8 @@ class Origin:
     """Time of receipt of the recording's first message [ns]."""
     names: Mapping[str, Sequence[str]] = attrs.field(factory=dict)
     """Feature -> names of its elements, where the caller states them in place of the dataset."""
+    units: str | None = None
+    """Type of what converted to the unit, if `convert` was given one."""
 
 
 def episode_origin(root: Path, metadata: Mapping[str, Any], number: int, given: Mapping[str, str]) -> Origin:
@@ -209,13 +213,13 @@ def episode_origin(root: Path, metadata: Mapping[str, Any], number: int, given: 
         document = metadata["configs"][episode["config"]] if episode.get("config") else {}
         contract = with_pinholes(Contract.from_canonical(metadata["contract"]).without_signals())
         recorded = dict(episode.get("recorded", {}))
-        norm_mode = metadata["conversion"]["norm_mode"]
+        norm_mode, units = metadata["conversion"]["norm_mode"], metadata["conversion"].get("units")
         own = {"prompt": episode["prompt"], "source": f"{root.resolve().name}:{number}"}
         outcome, start_ns = episode["outcome"], episode["start_ns"]
     except (KeyError, IndexError, TypeError) as error:
         raise RecorderError(f"{root}: the metadata of episode {number} cannot be read: {error!r}") from None
     recorded |= own | robot_metadata(contract, document, {"converted": calibration} if calibration else {})
-    return Origin(recorded, contract, document, calibration, norm_mode, outcome, start_ns)
+    return Origin(recorded, contract, document, calibration, norm_mode, outcome, start_ns, units=units)
 
 
 def _origin_as_given(root: Path, given: Mapping[str, str]) -> Origin:
