@@ -285,7 +285,7 @@ def _progress(episodes: int, quiet: bool) -> Iterator[Any]:
             nonlocal done
             if report is not None and not quiet:
                 done += 1
-                what = report.error.splitlines()[0] if report.error else f"{counted(report.frames, 'frame')}"
+                what = report.error.splitlines()[0] if report.error else counted(report.frames, "frame")
                 echo(f"{report.source}: {what} ({done} of {episodes}, {rate(frames)})", err=True)
 
         yield line

@@ -17,9 +17,6 @@ UUID_KEY = "uuid"
 """Key of the metadata. The value is random for a live recording, and derived from the other metadata in lockstep."""
 
 
-"""Key of the metadata of a part of an episode: the recordings that contain it, see `recording_of`."""
-
-
 def identity(reader: EpisodeReader, summary: EpisodeSummary) -> str:
     """Hash of an episode in its present state: equal for copies, different for another part of it.
 

@@ -22,7 +22,7 @@ class Session(Event):
 
     @override
     def shown(self) -> Shown:
-        count = f"{counted(self.saved, 'episode')}"
+        count = counted(self.saved, "episode")
         progress = None
         if self.wanted is not None:
             count = f"{self.saved} of {counted(self.wanted, 'episode')}"

@@ -12,8 +12,6 @@ from ibrobot_core.app import RunView
 from ibrobot_detect.detector import Detection, Detector, Sight, box_of, fits
 from ibrobot_detect.options import SceneOptions
 
-"""The service of the section `world`."""
-
 
 class SceneDetector(Detector):
     """Finds objects by their names in the world.

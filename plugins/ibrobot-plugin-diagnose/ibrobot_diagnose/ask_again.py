@@ -34,7 +34,6 @@ from ibrobot_core.app import FrameAssembler, RobotConfig, from_document, install
 from ibrobot_diagnose.pictures import Shown, reddened
 from ibrobot_diagnose.window import Asked, Floats, Window
 
-"""Prefix of outputs that say where a model looks in a picture, of shape (h, w)."""
 _log = logging.getLogger("ibrobot.diagnose")
 _MOST, _MOST_OF_PARTS = 8, 3
 """Frames on which the model is asked with changed observations, and with changed parts of a vector."""

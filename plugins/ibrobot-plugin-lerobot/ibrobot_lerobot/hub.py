@@ -72,7 +72,7 @@ def push(dataset: Path, repository: str, *, private: bool = False) -> str:
         old = [name for name in there if name.split("/")[0] in _KINDS and name not in files]
         operations += [hub.CommitOperationDelete(name) for name in old]
         done = api.create_commit(
-            repository, operations, repo_type="dataset", commit_message=f"{counted(contents.episodes, 'episode')}"
+            repository, operations, repo_type="dataset", commit_message=counted(contents.episodes, "episode")
         )
         version = json.loads((dataset / "meta" / "info.json").read_text(encoding="utf-8"))["codebase_version"]
         tags = [each.name for each in api.list_repo_refs(repository, repo_type="dataset").tags]

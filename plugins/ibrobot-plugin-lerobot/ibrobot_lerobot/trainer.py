@@ -40,7 +40,7 @@ _REPORTS = 200
 _END_S = 10.0
 INTERRUPTED = 130
 _MAKES_CARDS = "datasets card"
-"""The command that makes a card of a dataset, and its file beside a checkpoint."""
+"""The command that makes a card of a dataset."""
 _WHEN_CONTINUING = ("--policy.device", "--steps", "--save_freq", "--log_freq", "--output_dir")
 """Arguments of a command that continues a training; LeRobot takes the others from the checkpoint."""
 _WATCH = "import os, signal, sys; sys.stdin.read(); os.killpg(0, signal.SIGKILL)"

@@ -22,7 +22,6 @@ from ibrobot_mcap.storage import Storage
 
 REPAIRED = "repaired"
 """Key of `custom_data` that states that an episode was repaired."""
-"""Key of the recordings that contain an episode, newest last, by UUID or, without one, by digest."""
 
 
 def rewrite(

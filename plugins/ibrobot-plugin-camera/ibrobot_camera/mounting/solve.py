@@ -63,7 +63,7 @@ class Mounting:
             f"position {x:.1f}, {y:.1f}, {z:.1f} mm ± {self.uncertain_mm:.1f}; roll, pitch, yaw {roll:.2f}, "
             f"{pitch:.2f}, {yaw:.2f} degrees ± {self.uncertain_deg:.2f}",
             f"cross-validation: {self.error_mm:.1f} mm and {self.error_deg:.2f} degrees; {self.error_px:.2f} px in "
-            f"{counted(len(self.used), 'picture')}",
+            + counted(len(self.used), "picture"),
         ]
         if self.solvers:
             apart = "; ".join(f"{name} {mm:.1f} mm, {deg:.2f} degrees" for name, (mm, deg) in self.solvers.items())

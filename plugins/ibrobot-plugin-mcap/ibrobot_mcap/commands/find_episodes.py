@@ -44,7 +44,7 @@ def opened(path: Path) -> Iterator[Rosbag2Reader]:
         raise RecorderError(f"{path}: there is no such episode")
     if path.is_dir() and not is_rosbag2(path):
         episodes = episodes_in(path)
-        count = "an episode" if len(episodes) == 1 else f"{counted(len(episodes), 'episode')}"
+        count = "an episode" if len(episodes) == 1 else counted(len(episodes), "episode")
         raise RecorderError(f"{path}: is a folder with {count}; choose one, e.g. {episodes[0]}")
     with closing(Rosbag2Reader(path)) as reader:
         yield reader
