@@ -192,6 +192,7 @@ def test_another_episode_of_the_same_number_is_not_overwritten(exact: Path, bags
     ("arguments", "words"),
     [
         (["--to", "bag", "--append"], "--append does not apply to --to bag"),
+        (["--to", "bag", "--units", "calibrated"], "--units does not apply to --to bag"),
         (["--episodes", "0"], "--episodes does not apply to --to dataset"),
         (["--to", "bag", "--episodes", "0,7"], "0,7: the dataset's episodes are 0 to 2"),
         (["--to", "bag", "--episodes", "all"], "'all' is neither a number nor a range"),

@@ -48,7 +48,7 @@ _Progress = Callable[[int], AbstractContextManager[Any]]
 _MIB = 1 << 20
 _ONLY_TO_DATASET = (
     "append", "type_", "force_contract", "any_robot", "missing", "outcome", "success", "jobs", "on", "shard",
-    "only", "context",
+    "only", "context", "units",
 )  # fmt: skip
 _EVENT_S = 0.1
 _MUCH = 0.1
