@@ -105,8 +105,16 @@ def test_text_that_makes_no_sense(robot, goal: str, message: str):
     ("goal", "scaling", "message"),
     [
         (5, 1.0, "a goal is a text such as 'home' or 'xyz=0.2,0.0,0.1', or a goal of ibrobot_core.api; got int"),
-        (JointGoal(("pan",), np.zeros(2)), 1.0, "goal has joints: 1, positions: 2, each joint once"),
-        (JointGoal(("pan", "pan"), np.zeros(2)), 1.0, "goal has joints: 2, positions: 2, each joint once"),
+        (
+            JointGoal(("pan",), np.zeros(2)),
+            1.0,
+            "goal has joints: 1, positions: 2; must have each joint once, with a position",
+        ),
+        (
+            JointGoal(("pan", "pan"), np.zeros(2)),
+            1.0,
+            "goal has joints: 2, positions: 2; must have each joint once, with a position",
+        ),
         (JointGoal(("tilt",), np.zeros(1)), 1.0, f"no joint 'tilt'; the joints are: {NAMES}"),
         (
             JointGoal(("pan",), np.array([math.nan])),

@@ -103,7 +103,8 @@ def _joint_target(goal: JointGoal, robot: Robot, velocity_scaling: float) -> Tar
         return Target(_described(goal), goal, velocity_scaling=velocity_scaling)
     positions = dict(zip(goal.joints, map(float, goal.positions), strict=False))
     if len(positions) != len(goal.joints) or len(goal.positions) != len(goal.joints):
-        raise invalid_goal(f"goal has joints: {len(goal.joints)}, positions: {len(goal.positions)}, each joint once")
+        counts = f"joints: {len(goal.joints)}, positions: {len(goal.positions)}"
+        raise invalid_goal(f"goal has {counts}; must have each joint once, with a position")
     for joint, value in positions.items():
         if not math.isfinite(value):
             raise invalid_goal(f"goal of joint {joint} is {value}, must be an angle in radians")
