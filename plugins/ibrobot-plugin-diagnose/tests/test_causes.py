@@ -677,6 +677,7 @@ def test_what_few_episodes_say_of_one_another_is_called_little(episodes: int, wa
     assert first == "a: It jerks."
     assert [each.startswith(warned) for each in more] == [True] * bool(warned)
     assert last.startswith("1 of ")
+    assert check.lines_of({**checked, "listed": [], "counts": {}})[:-1] == more
 
 
 def test_consequence_of_the_first_cause_says_to_fix_that_first(data):

@@ -198,7 +198,7 @@ def _seen(window: Window, at_s: float) -> Iterator[Shown]:
 
 
 def lines_of(checked: Mapping[str, Any]) -> list[str]:
-    """A line for each listed episode, worst first, and each cause with a mistake; at last the counts."""
+    """A line for each listed episode, worst first, each cause with a mistake, and few episodes; at last the counts."""
     listed, of = checked["listed"], checked["episodes"] - len(checked["unreadable"])
     lacking = f"{len(checked['unreadable'])} of {counted(checked['episodes'], 'episode')} could not be read"
     untested = [
@@ -209,14 +209,16 @@ def lines_of(checked: Mapping[str, Any]) -> list[str]:
     if not of:
         return [*untested, f"Nothing was checked: {lacking}."]
     rest = f"; {lacking}" if checked["unreadable"] else ""
+    notes = untested
+    if of < _ENOUGH:
+        few = f"Only {counted(of, 'episode')} to compare: look at them yourself, and check again with more."
+        notes = [*untested, few]
     if not listed:
-        return [*untested, f"Nothing was found in {counted(of, 'episode')}{rest}."]
+        return [*notes, f"Nothing was found in {counted(of, 'episode')}{rest}."]
     lines = []
     for each in listed:
         first, *others = each["causes"]
         more = f" Also: {', '.join(other['name'] for other in others)}." if others else ""
         lines.append(f"{each['episode']}: {first['text']}{more}")
     names = ", ".join(f"{name} {count}" for name, count in checked["counts"].items())
-    if of < _ENOUGH:
-        untested.append(f"Only {counted(of, 'episode')} to compare: look at them yourself, and check again with more.")
-    return [*lines, *untested, f"{len(listed)} of {counted(of, 'episode')} to look at: {names}{rest}"]
+    return [*lines, *notes, f"{len(listed)} of {counted(of, 'episode')} to look at: {names}{rest}"]
