@@ -624,6 +624,20 @@ def test_cameras_are_exchanged_in_nearly_all_pictures(share, data):
     assert ("cameras_exchanged" in names_of(windows[0], data)) == (share == 1)
 
 
+@pytest.mark.parametrize("share", [0.58, 0.75])
+def test_cameras_are_exchanged_if_pictures_are_much_closer_to_the_other_s(share, data):
+    """Pictures of a new scene may all be a little closer to the other camera's by chance."""
+    window = window_of(Run(seed=9331, outcome="failure", **{**BOTH, "seconds": 8}))
+    assert data.card is not None
+    one, other = pairs(window, data.card)
+    mixed = [
+        [attrs.evolve(a, small=np.uint8(share * b.small + (1 - share) * a.small)) for a, b in zip(*each, strict=True)]
+        for each in ((one.camera.pictures, other.camera.pictures), (other.camera.pictures, one.camera.pictures))
+    ]
+    one.camera.pictures[:], other.camera.pictures[:] = mixed
+    assert ("cameras_exchanged" in names_of(window, data)) == (share == 0.75)
+
+
 def test_joint_that_the_cameras_hardly_see_has_no_shifted_zero(data):
     """Its positions at pictures that look the same differ from demonstration to demonstration."""
     shifted = window_of(Run(seed=9325, zero={0: 0.35}, start=(0.35, 0, 0, 0), outcome="failure", **ONE))
