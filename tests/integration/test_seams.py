@@ -151,9 +151,13 @@ def called_by_name() -> Iterator[tuple[str, str]]:
 
 
 def _constants(tree: ast.Module) -> Iterator[tuple[str, Any]]:
-    """The constants of a module."""
+    """The constants of a module, and those that it imports."""
     for node in tree.body:
         match node:
+            case ast.ImportFrom(module=str(module), names=names) if module.startswith("ibrobot_"):
+                for each in names:
+                    if each.name.isupper():
+                        yield each.asname or each.name, getattr(import_module(module), each.name)
             case ast.Assign(targets=[ast.Name(id=name)], value=ast.Constant(value=value)):
                 yield name, value
             case ast.Assign(targets=[ast.Tuple(elts=names)], value=ast.Tuple(elts=values)):
