@@ -40,8 +40,10 @@ _REACHED = 0.002
 _FIRST_STEPS, _LAST_STEPS = 9, 2
 _FRICTION = 0.06
 """About the dry friction of a healthy servo [Nm]."""
-_SURELY = 0.97
-"""A candidate must have at most this share of the error of the ones before it."""
+_SURELY, _CLEARLY = 0.97, 0.9
+"""A candidate must have at most this share of the error of the ones before it; so must one that divides lost motion
+otherwise between friction and backlash."""
+_LOSE_MOTION = ("frictionloss", "backlash")
 
 
 @attrs.frozen
@@ -361,14 +363,35 @@ def fit(
 
 def _exchanged(arm: FedArm, recordings: Sequence[Recording], start: ArmParameters) -> ArmParameters:
     """For each joint friction alone, unless it is worse; both lose motion, and a fit may end with the wrong one."""
-    by_backlash, by_friction = {}, {}
-    for name, each in start.joints.items():
+    by_friction, by_backlash, _ = _splits(start)
+    return _best(arm, recordings, [by_friction, start, by_backlash], _CLEARLY)
+
+
+def _splits(parameters: ArmParameters) -> tuple[ArmParameters, ArmParameters, ArmParameters]:
+    """The same lost motion of each joint by friction alone, with a healthy servo's friction, and with half its own."""
+    alone: dict[str, JointParameters] = {}
+    healthy: dict[str, JointParameters] = {}
+    half: dict[str, JointParameters] = {}
+    for name, each in parameters.joints.items():
         lost = each.backlash + 2 * each.frictionloss / each.kp
-        friction = min(each.frictionloss, _FRICTION)
-        by_backlash[name] = attrs.evolve(each, frictionloss=friction, backlash=lost - 2 * friction / each.kp)
-        by_friction[name] = attrs.evolve(each, frictionloss=lost * each.kp / 2, backlash=0.0)
-    candidates = [attrs.evolve(start, joints=joints) for joints in (by_friction, start.joints, by_backlash)]
-    return _best(arm, recordings, candidates, 0.9)
+        alone[name] = attrs.evolve(each, frictionloss=lost * each.kp / 2, backlash=0.0)
+        for others, friction in ((healthy, min(each.frictionloss, _FRICTION)), (half, each.frictionloss / 2)):
+            others[name] = attrs.evolve(each, frictionloss=friction, backlash=lost - 2 * friction / each.kp)
+    by_friction, by_backlash, by_both = (attrs.evolve(parameters, joints=joints) for joints in (alone, healthy, half))
+    return by_friction, by_backlash, by_both
+
+
+def _undivided(arm: FedArm, recordings: Sequence[Recording], parameters: ArmParameters) -> dict[tuple[str, str], float]:
+    """How far friction and backlash of a joint are from other values, in their units, that fit as well."""
+    errors = _error_by_joint(arm, recordings, parameters)
+    away: dict[tuple[str, str], float] = {}
+    for other in _splits(parameters):
+        others = _error_by_joint(arm, recordings, other)
+        for (name, each), error, its in zip(parameters.joints.items(), errors, others, strict=True):
+            for what in _LOSE_MOTION if its < error / _SURELY else ():
+                difference = abs(getattr(other.joints[name], what) - getattr(each, what))
+                away[name, what] = max(difference, away.get((name, what), 0.0))
+    return away
 
 
 def refit(
@@ -376,15 +399,18 @@ def refit(
     said: Callable[[str], None] = lambda text: None,
 ) -> Fitted:  # fmt: skip
     """Fit the parameters from a fit of similar recordings, and find how well each is known; as `fit`."""
-    problem = _Problem(arm, some(recordings, _ALL_S), start, prior)
-    parameters, vector = _stepped(problem, _LAST_STEPS, said)
+    parts = some(recordings, _ALL_S)
+    begin = _best(arm, parts, [start, *_splits(start)], _CLEARLY)
+    problem = _Problem(arm, parts, begin, prior)
+    parameters, vector = _stepped(problem, _LAST_STEPS if begin == start else _FIRST_STEPS // 2, said)
     said("how well each is known")
     needed, beyond = arm.torques(parameters, recordings)
+    unreached = {(each, "torque_limit") for each, share in zip(problem.joints, beyond, strict=True) if share < _REACHED}
+    least = _undivided(arm, parts, parameters)
     known = [
-        attrs.evolve(each, deviation=each.prior)
-        if each.name == "torque_limit" and beyond[problem.joints.index(each.joint)] < _REACHED
-        else each
+        attrs.evolve(each, deviation=each.prior if place in unreached else max(each.deviation, least.get(place, 0.0)))
         for each in _known(problem, vector, _deviations(problem, vector))
+        for place in [(each.joint, each.name)]
     ]
     return Fitted(parameters, tuple(known), needed, problem.held)
 
