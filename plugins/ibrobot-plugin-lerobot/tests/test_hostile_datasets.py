@@ -229,7 +229,7 @@ def other_tasks(root: Path) -> None:
          "task_index: 4503599627370496 is not a number of a task"),
         ("v2.1", lambda root: (root / "meta/info.json").write_text('{"codebase_version": ' + "[" * 100_000),
          "is not a LeRobot dataset"),
-        ("v2.1", other_tasks, "episode_000000.parquet: .*task_index from -1 to -1, of 2 tasks"),
+        ("v2.1", other_tasks, "episode_000000.parquet: .*task_index from -1 to -1, of 2 in all"),
         ("v3.0 pictures", info(fps=0), "info.json: fps: 0 is not a frame rate"),
         ("v3.0", no_unit, "depth_unit: None is none of mm, m"),
     ],

@@ -259,8 +259,8 @@ def wrong_counts(root: Path) -> None:
 
 ODDITIES: dict[str, tuple[Callable[[Path], None], str]] = {
     "no videos": (no_videos, "observation.images.top: "),
-    "a missing video": (missing_video, "missing 1 of 1 video, e.g. "),
-    "pointers to videos": (pointers_to_videos, "missing 1 of 1 video, e.g. "),
+    "a missing video": (missing_video, ": missing "),
+    "pointers to videos": (pointers_to_videos, ": missing "),
     "language": (language, "language_persistent: [{"),
     "channels first": (channels_first, "64x96x3"),
     "no robot": (no_robot, "3 episodes"),
