@@ -12,8 +12,9 @@ from arm_moves import TICK_NS, moves
 from ibrobot_mujoco.hardware import MujocoHardware
 from ibrobot_mujoco.identification.contents import contents_of, lines_of, read_contents, write_report
 from ibrobot_mujoco.identification.findings import findings_of
-from ibrobot_mujoco.identification.fit import ARM
+from ibrobot_mujoco.identification.fit import ARM, refit
 from ibrobot_mujoco.identification.identify import Result, identify
+from ibrobot_mujoco.identification.simulation import FedArm
 from ibrobot_mujoco.options import MujocoOptions
 from ibrobot_mujoco.parameters import JointParameters, read_parameters
 from ibrobot_mujoco.scenes import scene
@@ -161,3 +162,17 @@ def test_gripper_that_holds_an_object_is_left_out(tmp_path: Path) -> None:
     assert held.fitted.held["gripper"] == pytest.approx(0.31, abs=0.03)
     assert held.parameters.joints["gripper"].kp == pytest.approx(11.0, rel=0.15)
     assert "gripper held something for" in "\n".join(held.lines())
+
+
+def test_backlash_that_a_fit_took_for_friction_is_found(tmp_path: Path) -> None:
+    """Both lose motion, and a fit that began with the wrong one may end there."""
+    recording = recorded(simulated(PLANTED, tmp_path), moves(24.0))
+    wrist = PLANTED.joints["wrist_roll"]
+    stiff = attrs.evolve(wrist, frictionloss=lost_motion(wrist) * wrist.kp / 2, backlash=0.0)
+    start = attrs.evolve(PLANTED, joints={**PLANTED.joints, "wrist_roll": stiff})
+    arm = FedArm(OPTIONS, ROBOT, 1)
+    try:
+        fitted = refit(arm, [recording], start, start)
+    finally:
+        arm.close()
+    assert fitted.of("wrist_roll", "backlash").value == pytest.approx(wrist.backlash, abs=0.006)
