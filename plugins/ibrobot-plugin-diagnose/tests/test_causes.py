@@ -631,7 +631,10 @@ def test_cameras_are_exchanged_if_pictures_are_much_closer_to_the_other_s(share,
     assert data.card is not None
     one, other = pairs(window, data.card)
     mixed = [
-        [attrs.evolve(a, small=np.uint8(share * b.small + (1 - share) * a.small)) for a, b in zip(*each, strict=True)]
+        [
+            attrs.evolve(a, small=(share * b.small + (1 - share) * a.small).astype(np.uint8))
+            for a, b in zip(*each, strict=True)
+        ]
         for each in ((one.camera.pictures, other.camera.pictures), (other.camera.pictures, one.camera.pictures))
     ]
     one.camera.pictures[:], other.camera.pictures[:] = mixed
