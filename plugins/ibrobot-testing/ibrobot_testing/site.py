@@ -63,10 +63,11 @@ def made_up_site(folder: Path, sources: Path, monkeypatch: pytest.MonkeyPatch) -
     """
     site = Site(folder, sources)
     folder.mkdir()
-    monkeypatch.syspath_prepend(str(folder))
-    monkeypatch.setenv("PYTHONPATH", str(folder))
-    installed_plugins.cache_clear()
-    yield site
-    installed_plugins.cache_clear()
+    with monkeypatch.context() as until_the_end:
+        until_the_end.syspath_prepend(str(folder))
+        until_the_end.setenv("PYTHONPATH", str(folder))
+        installed_plugins.cache_clear()
+        yield site
+    installed_plugins.cache_clear()  # the folder is no longer on the path: nothing after this finds its plugins
     for module in site.modules:
         sys.modules.pop(module, None)
