@@ -1,4 +1,4 @@
-"""The in-process bus: topics with bounded queues per subscriber, latched topics, counted drops, and service calls."""
+"""The in-process bus: topics with bounded queues per subscriber, latched topics, counted drops, and the services."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Declared services: a name, and the classes of its request and answer. Requests from outside are plain data."""
+"""Services: declared by a name and the classes of request and answer, served and called in a table of a process."""
 
 from __future__ import annotations
 

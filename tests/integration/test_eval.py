@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from command_line import run_here
-from evaluations import episodes_here, ready_forkserver
+from evaluations import MINI, episodes_here, ready_forkserver
 from ibrobot_testing.site import made_up_site
 
 from ibrobot_core.config import find_config
@@ -30,16 +30,9 @@ pytestmark = pytest.mark.integration
 PATIENCE_S = 120.0
 
 
-REACH = """\
-robot:
-  name: mini
-  joints:
-    - {name: pan, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}
-    - {name: grip, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}
-  groups: {all: [pan, grip]}
-simulation: {type: reach}
-executors:
-  all_position: {type: position, group: all}
+REACH = (
+    MINI
+    + """\
 models:
   good: {type: bad, how: good}
   poor: {type: bad, how: poor}
@@ -57,6 +50,7 @@ contract:
     - {executor: all_position, topic: /all/commands}
 control: {rate_hz: 100, stop: hold}
 """
+)
 """A robot whose episodes are computed quickly, with the same modes."""
 
 

@@ -11,22 +11,15 @@ from typing import Any, override
 
 import pytest
 from command_line import run_here
-from evaluations import Here, episodes_here, ready_forkserver
+from evaluations import MINI, Here, episodes_here, ready_forkserver
 from ibrobot_provenance.jobs import Done, Job
 from ibrobot_testing.site import Site, made_up_site
 
 pytestmark = pytest.mark.integration
 
-ROBOT = """\
-robot:
-  name: mini
-  joints:
-    - {name: pan, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}
-    - {name: grip, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}
-  groups: {all: [pan, grip]}
-simulation: {type: reach}
-executors:
-  all_position: {type: position, group: all}
+ROBOT = (
+    MINI
+    + """\
 models:
   bad: {type: bad, how: good}
 control_modes:
@@ -41,6 +34,7 @@ contract:
     - {executor: all_position, topic: /all/commands}
 control: {rate_hz: 50, stop: hold}
 """
+)
 
 
 @pytest.fixture(scope="module", autouse=True)

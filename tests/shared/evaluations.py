@@ -1,4 +1,4 @@
-"""Evaluations in tests: a pool without processes, and the process from which pools start theirs."""
+"""Evaluations in tests: a small arm, a pool without processes, and the process from which pools start theirs."""
 
 from __future__ import annotations
 
@@ -13,6 +13,19 @@ import pytest
 from ibrobot_provenance.jobs import Done, Job, Pool
 
 from ibrobot_core.app import installed_plugins
+
+MINI = """\
+robot:
+  name: mini
+  joints:
+    - {name: pan, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}
+    - {name: grip, lower: -1.0, upper: 1.0, max_velocity: 2.0, max_acceleration: 10.0}
+  groups: {all: [pan, grip]}
+simulation: {type: reach}
+executors:
+  all_position: {type: position, group: all}
+"""
+"""The beginning of the YAML of an arm of two joints, simulated by `reach`."""
 
 
 @contextmanager

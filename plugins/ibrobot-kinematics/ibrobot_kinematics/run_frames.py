@@ -1,4 +1,4 @@
-"""Poses of sensors in the base frame, from `/tf` and `/tf_static`."""
+"""What a run says of places in the base frame: poses of sensors, from `/tf`, and the service of objects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Viewer `web`: starts the page's server, sends it states and pictures, and carries out the commands of pages."""
+"""Viewer `web`: starts the page's server, sends it states and pictures, and connects it with the commands of pages."""
 
 from __future__ import annotations
 

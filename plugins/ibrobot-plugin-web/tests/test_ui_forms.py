@@ -47,7 +47,7 @@ def opened(folder: Path) -> Iterator[Any]:
 
 
 def form(page: Any, name: str) -> Any:
-    """Go to a view whose form is shown anew, as after the page was opened again."""
+    """Go to a view as if the page had just been opened."""
     page.evaluate(f"location.hash = {name!r}")
     page.reload()
     found = page.locator(f"#view-{name} form")
