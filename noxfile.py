@@ -444,8 +444,8 @@ def types(session: nox.Session) -> None:
 @nox.session
 def layers(session: nox.Session) -> None:
     """Which module may import which: the contracts in tests/house/imports.toml."""
-    install(session, *PLUGINS, groups=("lint",))
-    session.run("python", "tests/house/lint_imports.py")
+    session.install("-c", "constraints.txt", *nox.project.dependency_groups(PROJECT, "lint"))
+    session.run("python", "tests/house/lint_imports.py", env={"PYTHONPATH": ":".join(map(str, LOCAL.values()))})
 
 
 @nox.session
