@@ -28,7 +28,7 @@ import yaml
 from figures import report
 from ibrobot_planning.client import Client
 from ibrobot_planning.execution.requests import GoTo
-from ibrobot_planning.goals.text import Target
+from ibrobot_planning.goals.grammar import Target
 from ibrobot_planning.world.objects import Box, World, WorldObject
 from ibrobot_ros2.calls import GoalRequest
 from ibrobot_ros2.goals import Actions

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import attrs
 
-from ibrobot_core.api import Descriptor
+from ibrobot_core.api import Descriptor, PlanCode, PlanningError
 
 if TYPE_CHECKING:
     from ibrobot_kinematics import PathConstraints
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from ibrobot_core.api import JointTrajectory, Pose, Vector, Vector3
 
 OrientationPolicy = Literal["refuse", "nearest", "keep_axis", "arm_plane", "current", "free"]
+LEAST_SCALING = 0.01
+"""Least fraction of the velocity and acceleration limits that a goal may ask for."""
 
 
 @attrs.frozen(eq=False)
@@ -95,6 +97,23 @@ type Goal = JointGoal | NamedGoal | PositionGoal | PoseGoal | AnyGoal | LinearGo
 def constrains(goal: Goal | None) -> bool:
     """Whether a goal, or one of its alternatives, has path constraints."""
     return isinstance(goal, ConstrainedGoal) or (isinstance(goal, AnyGoal) and any(map(constrains, goal.goals)))
+
+
+def invalid_goal(message: str) -> PlanningError:
+    """The error for an invalid goal, with MoveIt's code."""
+    return PlanningError(message, PlanCode.INVALID_GOAL_CONSTRAINTS)
+
+
+def scaling_fault(name: str, scaling: float) -> str:
+    """Why a fraction of the limits is invalid; empty if it is valid.
+
+    Args:
+        name: its name, e.g. `velocity_scaling`.
+        scaling: the fraction.
+    """
+    if LEAST_SCALING <= scaling <= 1:  # false for NaN
+        return ""
+    return f"{name} is {scaling}, must be from {LEAST_SCALING} to 1"
 
 
 @attrs.frozen(eq=False)

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner, Result
 from ibrobot_kinematics.srdf import GroupState, Srdf, read_srdf
 from ibrobot_kinematics.urdf import read_urdf
-from ibrobot_planning.goals.text import target
+from ibrobot_planning.goals.grammar import target
 from ibrobot_testing.command import command_line
 from ibrobot_testing.site import made_up_site
 

@@ -15,7 +15,7 @@ from ibrobot_planning.client import Client
 from ibrobot_planning.execution.requests import Execute, GoTo
 from ibrobot_planning.execution.results import MoveResult
 from ibrobot_planning.execution.source import EXECUTE, GO_TO
-from ibrobot_planning.goals.text import Target
+from ibrobot_planning.goals.grammar import Target
 from ibrobot_planning.planner import PlanRequest, PlanResult
 from ibrobot_planning.planners.completion import MOST_POINTS, Start, completed
 from ibrobot_planning.planners.timing import LONGEST_S

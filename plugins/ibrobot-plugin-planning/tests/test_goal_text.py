@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from ibrobot_planning.goals.text import target
+from ibrobot_planning.goals.grammar import target
 from ibrobot_planning.planner import AnyGoal, JointGoal, NamedGoal, PoseGoal, PositionGoal
 
 from ibrobot_core.api import PlanCode, PlanningError, Quaternion, Vector3

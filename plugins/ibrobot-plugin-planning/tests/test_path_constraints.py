@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from ibrobot_kinematics import PathConstraints
 from ibrobot_kinematics.path_constraints import AXES
 from ibrobot_planning.execution.requests import CartesianQuery
-from ibrobot_planning.goals.grammar import GoalOptions
-from ibrobot_planning.goals.text import target
+from ibrobot_planning.goals.grammar import GoalOptions, target
 from ibrobot_planning.planner import (
     AnyGoal,
     ConstrainedGoal,

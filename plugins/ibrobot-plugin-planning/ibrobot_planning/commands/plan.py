@@ -36,7 +36,7 @@ from ibrobot_core.app import (
     wrong_input,
 )
 from ibrobot_planning.execution.plans import GoalPlans, arm_joints
-from ibrobot_planning.goals.text import Target, target
+from ibrobot_planning.goals.grammar import Target, target
 from ibrobot_planning.planner import ConstrainedGoal, PoseGoal, PositionGoal
 from ibrobot_planning.planners.search import length
 from ibrobot_planning.planners.timing import motion_of

@@ -24,10 +24,8 @@ from ibrobot_core.api import (
 )
 from ibrobot_core.app import ControlMode, RobotConfig, RunView
 from ibrobot_planning.execution.motions import commanded
-from ibrobot_planning.goals.errors import invalid_goal
-from ibrobot_planning.goals.grammar import GoalOptions
+from ibrobot_planning.goals.grammar import GoalOptions, Target
 from ibrobot_planning.goals.joints import without_names
-from ibrobot_planning.goals.text import Target
 from ibrobot_planning.goals.tool import Tool
 from ibrobot_planning.planner import (
     AnyGoal,
@@ -38,6 +36,7 @@ from ibrobot_planning.planner import (
     PlannerDescriptor,
     PlanRequest,
     PlanResult,
+    invalid_goal,
 )
 from ibrobot_planning.planners.completion import Start, check_size, completed
 from ibrobot_planning.world.objects import World, world_of

@@ -20,9 +20,8 @@ from ibrobot_core.api import (
     documented,
     option,
 )
-from ibrobot_planning.goals.grammar import LEAST_SCALING, GoalOptions, check_waypoints
-from ibrobot_planning.goals.text import Target
-from ibrobot_planning.planner import Goal
+from ibrobot_planning.goals.grammar import GoalOptions, Target, check_waypoints
+from ibrobot_planning.planner import LEAST_SCALING, Goal
 from ibrobot_planning.world.ages import AgeSummary
 
 

@@ -27,11 +27,9 @@ from ibrobot_planning.execution.requests import (
     PlanningScene,
     PlanQuery,
 )
-from ibrobot_planning.goals.errors import invalid_goal
-from ibrobot_planning.goals.grammar import line_goal
-from ibrobot_planning.goals.text import target
+from ibrobot_planning.goals.grammar import line_goal, target
 from ibrobot_planning.goals.tool import Candidate
-from ibrobot_planning.planner import Goal, PlanRequest, PlanResult
+from ibrobot_planning.planner import Goal, PlanRequest, PlanResult, invalid_goal
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.world.engines import find_engines
 from ibrobot_planning.world.objects import observed_world, world_of

@@ -40,8 +40,7 @@ from ibrobot_planning.execution.plans import GoalPlans
 from ibrobot_planning.execution.requests import Execute, GoTo, MoveRequest, MoveToConfiguration, MoveToPose, Numbered
 from ibrobot_planning.execution.results import MoveResult, Outcome, results_of
 from ibrobot_planning.execution.services import PlanningServices
-from ibrobot_planning.goals.grammar import check_frame
-from ibrobot_planning.goals.text import Target, target
+from ibrobot_planning.goals.grammar import Target, check_frame, target
 from ibrobot_planning.goals.tool import pose_matrix
 from ibrobot_planning.planner import (
     AnyGoal,

@@ -10,9 +10,16 @@ from ibrobot_kinematics.srdf import GroupState, read_srdf
 from ibrobot_kinematics.urdf import read_urdf
 
 from ibrobot_core.api import PlanCode, PlanningError, Robot, Vector
-from ibrobot_planning.goals.errors import invalid_goal
-from ibrobot_planning.goals.grammar import scaling_fault
-from ibrobot_planning.planner import AnyGoal, ConstrainedGoal, Goal, JointGoal, NamedGoal, PlanRequest
+from ibrobot_planning.planner import (
+    AnyGoal,
+    ConstrainedGoal,
+    Goal,
+    JointGoal,
+    NamedGoal,
+    PlanRequest,
+    invalid_goal,
+    scaling_fault,
+)
 
 
 def pose_names(robot: Robot) -> list[str]:

@@ -22,8 +22,7 @@ from ibrobot_kinematics.rotations import between, cross, log
 from ibrobot_kinematics.search import TABLE_LEVER_M, search, starts_from_table
 
 from ibrobot_core.api import PlanCode, PlanningError, Vector, Vector3
-from ibrobot_planning.goals.errors import invalid_goal, unreachable
-from ibrobot_planning.planner import Goal, PoseGoal, PositionGoal
+from ibrobot_planning.planner import Goal, PoseGoal, PositionGoal, invalid_goal
 
 _PITCHES = np.linspace(-np.pi / 2, np.pi / 2, 7)
 """Directions of the tool that are tried if a goal has none: from straight down to straight up."""
@@ -57,6 +56,11 @@ class Candidate:
     """[m]."""
     orientation_error: float = 0.0
     """[rad]."""
+
+
+def _unreachable(message: str) -> PlanningError:
+    """The error for a goal that the arm cannot reach."""
+    return PlanningError(message, PlanCode.NO_IK_SOLUTION)
 
 
 def vector(value: Vector3, what: str) -> Vector:
@@ -204,7 +208,7 @@ class Tool:
             try:
                 solve(self.model, Target(position), start)
             except UnreachableError as error:
-                raise unreachable(str(error)) from error
+                raise _unreachable(str(error)) from error
 
     def _beyond(
         self, goal: PoseGoal, position: Vector, rotation: Vector, start: Vector, nearest: list[Candidate]
@@ -217,7 +221,7 @@ class Tool:
                 self._at(position, None, start, tolerance, 0.01)  # its error tells how far off the position is
             if policy == "refuse" or not nearest:
                 off = np.degrees(nearest[0].orientation_error) if nearest else 180.0
-                raise unreachable(
+                raise _unreachable(
                     f"{self.model.tip} cannot take this orientation at {_text(position)};"
                     f" the nearest found is {off:.1f} degrees off (beyond_reach chooses what to do then)"
                 )
@@ -232,7 +236,7 @@ class Tool:
         else:
             taken = self._posed(position, self.model.forward(start).rotation, start, tolerance)
             if not taken:
-                raise unreachable(f"{self.model.tip} cannot keep its orientation at {_text(position)}")
+                raise _unreachable(f"{self.model.tip} cannot keep its orientation at {_text(position)}")
         return [self._compared(each.joints, position, rotation) for each in taken]
 
     def _in_plane(self, position: Vector, axis: Vector) -> Vector:
@@ -266,7 +270,7 @@ class Tool:
         distinct = _distinct(solutions)
         if not distinct:
             assert error is not None
-            raise unreachable(str(error)) from error
+            raise _unreachable(str(error)) from error
         return [self._compared(q, position, None, axis) for q in distinct]
 
     def _pitched(self, position: Vector) -> Iterator[Vector]:

@@ -10,9 +10,8 @@ from ibrobot_kinematics import KinematicModel, Target, ToolConstraints, Unreacha
 from ibrobot_kinematics.rotations import between, cross, exp, log
 
 from ibrobot_core.api import Vector
-from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.tool import HELD_BACK, Tool, pose_matrix, turned, unit, vector
-from ibrobot_planning.planner import PoseGoal, PositionGoal
+from ibrobot_planning.planner import PoseGoal, PositionGoal, invalid_goal
 
 _STEP_M = 0.004
 _STEP_RAD = 0.05

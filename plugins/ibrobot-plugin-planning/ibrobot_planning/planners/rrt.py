@@ -12,7 +12,6 @@ import numpy as np
 from ibrobot_kinematics import ToolConstraints, robot_model
 
 from ibrobot_core.api import Context, JointTrajectory, PlanCode, PlanningError, Vector
-from ibrobot_planning.goals.errors import invalid_goal
 from ibrobot_planning.goals.joints import checked_start, joint_target
 from ibrobot_planning.goals.tool import Candidate, Tool
 from ibrobot_planning.planner import (
@@ -27,6 +26,7 @@ from ibrobot_planning.planner import (
     PlanResult,
     PoseGoal,
     PositionGoal,
+    invalid_goal,
 )
 from ibrobot_planning.planners.constrained import ConstrainedChecks, ConstrainedSpace
 from ibrobot_planning.planners.linear import linear_path

@@ -8,10 +8,9 @@ from typing import Any, Literal, override
 import attrs
 
 from ibrobot_core.api import Robot, Vector, documented, option
-from ibrobot_planning.goals.grammar import LEAST_SCALING, GoalOptions, check_waypoints, exactly_one, line_goal
+from ibrobot_planning.goals.grammar import GoalOptions, Target, check_waypoints, exactly_one, line_goal
 from ibrobot_planning.goals.joints import named_pose
-from ibrobot_planning.goals.text import Target
-from ibrobot_planning.planner import AnyGoal, Goal
+from ibrobot_planning.planner import LEAST_SCALING, AnyGoal, Goal
 from ibrobot_planning.world.objects import World
 
 MOST_STEPS = 200

@@ -20,8 +20,7 @@ from ibrobot_planning.execution.source import CANCEL as CANCEL_MOTION
 from ibrobot_planning.execution.source import GO_TO
 from ibrobot_planning.execution.source import RESULT as MOTION_RESULT
 from ibrobot_planning.executors.options import GripperOptions
-from ibrobot_planning.goals.grammar import object_pose
-from ibrobot_planning.goals.text import Target
+from ibrobot_planning.goals.grammar import Target, object_pose
 from ibrobot_planning.tasks.checks import CheckedTask
 from ibrobot_planning.tasks.format import (
     Alternatives,
