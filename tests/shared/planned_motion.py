@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import yaml
 from ibrobot_kinematics import robot_model
-from ibrobot_planning.execution.results import MoveResult
+from ibrobot_planning.execution.requests import MoveResult
 from ibrobot_planning.world.objects import Box, World, WorldObject
 from planning import Referee
 from planning_scenes import ARM_JOINTS

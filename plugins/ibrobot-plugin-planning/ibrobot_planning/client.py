@@ -25,7 +25,7 @@ from ibrobot_core.api import (
     Vector3,
 )
 from ibrobot_core.app import Runtime, installed_plugins, single_options
-from ibrobot_planning.execution.results import MoveResult
+from ibrobot_planning.execution.requests import MoveResult
 from ibrobot_planning.execution.source import EXECUTE
 
 type GoalKeys = Mapping[str, Any]

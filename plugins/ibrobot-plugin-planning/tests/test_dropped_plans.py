@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ibrobot_planning.execution.results import MoveResult
+from ibrobot_planning.execution.requests import MoveResult
 from ibrobot_planning.execution.source import CANCEL, GO_TO, RESULT, PlannerSource
 from ibrobot_planning.planner import AnyGoal, Goal, JointGoal, LinearGoal, PlanRequest, PlanResult, PositionGoal
 

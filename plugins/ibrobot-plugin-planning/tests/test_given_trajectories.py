@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_planning.client import Client
-from ibrobot_planning.execution.requests import Execute, GoTo
-from ibrobot_planning.execution.results import MoveResult
+from ibrobot_planning.execution.requests import Execute, GoTo, MoveResult
 from ibrobot_planning.execution.source import EXECUTE, GO_TO
 from ibrobot_planning.goals.grammar import Target
 from ibrobot_planning.planner import PlanRequest, PlanResult

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from ibrobot_planning.execution.plans import GoalPlans
-from ibrobot_planning.execution.requests import GoTo, MoveToConfiguration, MoveToPose, Numbered
-from ibrobot_planning.execution.results import MoveResult, Results
+from ibrobot_planning.execution.requests import GoTo, MoveResult, MoveToConfiguration, MoveToPose, Numbered, Results
 from ibrobot_planning.execution.services import CARTESIAN, COMPUTE_FK, COMPUTE_IK, PLAN
 from ibrobot_planning.execution.source import (
     CANCEL,

@@ -37,8 +37,17 @@ from ibrobot_planning.execution.door import door_of
 from ibrobot_planning.execution.log_limiter import LogLimiter
 from ibrobot_planning.execution.motions import Execution, commanded
 from ibrobot_planning.execution.plans import GoalPlans
-from ibrobot_planning.execution.requests import Execute, GoTo, MoveRequest, MoveToConfiguration, MoveToPose, Numbered
-from ibrobot_planning.execution.results import MoveResult, Outcome, results_of
+from ibrobot_planning.execution.requests import (
+    Execute,
+    GoTo,
+    MoveRequest,
+    MoveResult,
+    MoveToConfiguration,
+    MoveToPose,
+    Numbered,
+    Outcome,
+    results_of,
+)
 from ibrobot_planning.execution.services import PlanningServices
 from ibrobot_planning.goals.grammar import Target, check_frame, target
 from ibrobot_planning.goals.tool import pose_matrix

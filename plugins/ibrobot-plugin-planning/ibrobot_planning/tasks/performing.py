@@ -13,8 +13,7 @@ from ibrobot_ros2.offers import SET_MODE
 from ibrobot_core.api import CompressedImage, IbrobotError, Image, PlanningError, Vector, ns, seconds
 from ibrobot_core.app import RunView
 from ibrobot_planning.execution.motions import commanded
-from ibrobot_planning.execution.requests import GoTo, Numbered, PlanAhead, PlanAnswer
-from ibrobot_planning.execution.results import MoveResult
+from ibrobot_planning.execution.requests import GoTo, MoveResult, Numbered, PlanAhead, PlanAnswer
 from ibrobot_planning.execution.services import PLAN_GOAL
 from ibrobot_planning.execution.source import CANCEL as CANCEL_MOTION
 from ibrobot_planning.execution.source import GO_TO

@@ -23,8 +23,7 @@ from ibrobot_core.app import (
     dump_yaml,
     fields,
 )
-from ibrobot_planning.execution.requests import Numbered
-from ibrobot_planning.execution.results import Results
+from ibrobot_planning.execution.requests import Numbered, Results
 from ibrobot_planning.tasks.checks import CheckedTask, Situation, check_task
 from ibrobot_planning.tasks.format import Step, TaskStep
 from ibrobot_planning.tasks.performing import Performance
