@@ -275,10 +275,12 @@ class RunLine:
 
     Args:
         channel: to the run.
+        on_end: called when the run has closed the channel.
     """
 
-    def __init__(self, channel: Channel) -> None:
+    def __init__(self, channel: Channel, on_end: Callable[[], None]) -> None:
         self._channel = channel
+        self._on_end = on_end
         self._numbers = itertools.count(1)
         self._answers: dict[int, Answer] = {}
 
@@ -302,6 +304,8 @@ class RunLine:
                     self._answers.pop(number)({"ok": value})
                 case {"reply": int() as number, "error": str() as why} if number in self._answers:
                     self._answers.pop(number)({"error": why})
+        if self._channel.closed:
+            self._on_end()
 
     def send(self, message: FromServer) -> None:
         """Send a message."""

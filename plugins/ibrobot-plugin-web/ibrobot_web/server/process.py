@@ -45,14 +45,18 @@ class RunLink:
     Args:
         channel: to the run.
         order: the order of the run.
+
+    Attributes:
+        receive: passes on the replies of the run.
+        ended: set when the run has ended.
     """
 
     def __init__(self, channel: Channel, order: Mapping[str, Any]) -> None:
-        self._channel = channel
         self._order = order
-        self._line = RunLine(channel)
         self._scene: asyncio.Future[bytes] | None = None
         self.ended = asyncio.Event()
+        self._line = RunLine(channel, self.ended.set)
+        self.receive = self._line.receive
         self.broadcast = Broadcast(self._pages_changed, frozenset({STATUS}))
         self.drive = Drive(self._line.execute, self._line.stop, self._line.release)
 
@@ -69,12 +73,6 @@ class RunLink:
         content = json.dumps(make_scene(self._order["description"]), separators=(",", ":")).encode()
         with contextlib.suppress(RuntimeError):  # the server has ended meanwhile
             made.get_loop().call_soon_threadsafe(made.set_result, content)
-
-    def receive(self) -> None:
-        """Handle the messages of the run."""
-        self._line.receive()
-        if self._channel.closed:
-            self.ended.set()
 
     async def relay(self, stream: Channel) -> None:
         """Broadcast the states and pictures of the run."""
