@@ -484,8 +484,10 @@ BAD: dict[str, Any] = {
     "point 1 has velocities [0.0, 0.0, 0.0]; it must be a list of 2 numbers": goal(
         point(1, AT_REST, AT_REST), point(2, AT_REST, (0.0, 0.0, 0.0))
     ),
-    "point 0 has nan among its positions; each must be a finite number": goal(point(1, (0.0, float("nan")))),
-    "point 0 has inf among its velocities; each must be a finite number": goal(
+    "point 0 has nan among its positions; each must be a finite number, up to 1e+06": goal(
+        point(1, (0.0, float("nan")))
+    ),
+    "point 0 has inf among its velocities; each must be a finite number, up to 1e+06": goal(
         point(1, AT_REST, (float("inf"), 0.0)), point(2, AT_REST, AT_REST)
     ),
     "point 1 has no velocities but point 0 has; all or none must": goal(point(1, AT_REST, AT_REST), point(2, AT_REST)),

@@ -27,9 +27,11 @@ from ibrobot_core.api import (
 from ibrobot_core.app import Spline
 from ibrobot_planning.executors.options import TrajectoryOptions
 from ibrobot_planning.executors.trajectory_goal import (
+    PLAUSIBLE,
     CheckedTrajectory,
-    check_plausible,
+    Points,
     check_positions,
+    check_rates,
     check_trajectory,
 )
 from ibrobot_planning.guard_label import in_words
@@ -127,9 +129,9 @@ class TrajectoryExecutor(Executor):
         if not isinstance(goal, FollowTrajectory):
             raise GoalRejected(f"expected a trajectory, got {goal}")
         checked = check_trajectory(goal, self.joints, self._options)
-        check_plausible(checked, self.joints, self._velocity, self._acceleration)
+        check_rates(checked.points, self.joints, self._velocity, self._acceleration, PLAUSIBLE)
         begin_ns = self._now_ns if goal.takes_over is None else self._takeover_ns(goal.takes_over, goal.at_ns)
-        following = _Running(goal_id, checked, begin_ns, self._spline(checked, begin_ns))
+        following = _Running(goal_id, checked, begin_ns, self._spline(checked.points, begin_ns))
         if self._next is not None:
             self._statuses.append(GoalStatus(self._next.goal_id, GoalState.CANCELED, f"replaced by goal {goal_id}"))
         self._next = following
@@ -253,11 +255,11 @@ class TrajectoryExecutor(Executor):
         left = _STOP_SHARE * self._acceleration + np.sign(velocity) * acceleration * rate**2
         return float((-left[moving] / np.abs(velocity[moving])).max())
 
-    def _spline(self, goal: CheckedTrajectory, begin_ns: int) -> Spline:
-        """A spline through the goal's points, from the setpoint at `begin_ns` [ns]."""
+    def _spline(self, points: Points, begin_ns: int) -> Spline:
+        """A spline through a goal's points, from the setpoint at `begin_ns` [ns]."""
         position, velocity, acceleration = self._sample(begin_ns)
-        times_ns, positions = goal.times_ns, goal.positions
-        velocities, accelerations = goal.velocities, goal.accelerations
+        times_ns, positions = points.times_ns, points.positions
+        velocities, accelerations = points.velocities, points.accelerations
         if times_ns[0] == 0:
             off = np.abs(positions[0] - position)
             if off.max() > START_TOLERANCE_RAD:

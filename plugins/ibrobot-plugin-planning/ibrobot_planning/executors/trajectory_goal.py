@@ -1,4 +1,4 @@
-"""Trajectory goals: checked, and in the executor's order of joints."""
+"""Points of trajectories as arrays, and goals in the executor's order of joints; both checked."""
 
 from __future__ import annotations
 
@@ -9,33 +9,44 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.api import FollowTrajectory, GoalRejected, JointTrajectoryPoint, Vector, ns
+from ibrobot_core.api import FollowTrajectory, GoalRejected, JointTrajectory, JointTrajectoryPoint, Vector, ns
 from ibrobot_planning.executors.options import TrajectoryOptions
 
 _LONGEST_S = 86_400.0
 """Largest `goal_time` [s]."""
 _WIDEST_RAD = 100.0
 """Largest tolerance; to check none, a goal says -1."""
-_PLAUSIBLE = 10.0
+PLAUSIBLE = 10.0
 """Largest velocity and acceleration of a point, as a share of the limits: whatever is above is a mistake."""
 BEYOND_RAD = 2e-5
 """Allowed excess of positions beyond a limit, for rounding."""
+_LARGEST = 1e6
+"""Largest number of a trajectory's points, in whatever unit: its sums stay finite."""
+STILL = 1e-6
+"""Velocities [rad/s] that count as rest."""
 _SHARES = np.linspace(0.0, 1.0, 65)
 """Where pieces of a spline that may leave the limits are sampled."""
 
 
 @attrs.frozen(eq=False)
-class CheckedTrajectory:
-    """A trajectory in the executor's joint order: N points of J joints."""
+class Points:
+    """The points of a trajectory: N points of J joints."""
 
     times_ns: NDArray[np.int64]
-    """[ns] from the start, strictly increasing, shape (N,)."""
+    """From the start, not negative, strictly increasing [ns], shape (N,)."""
     positions: Vector
     """[rad], shape (N, J)."""
     velocities: Vector | None
     """[rad/s], shape (N, J)."""
     accelerations: Vector | None
     """[rad/s^2], shape (N, J)."""
+
+
+@attrs.frozen(eq=False)
+class CheckedTrajectory:
+    """A trajectory in the executor's order of joints."""
+
+    points: Points
     path_tolerance: Vector
     """[rad], shape (J,); 0: not checked."""
     goal_tolerance: Vector
@@ -50,8 +61,21 @@ def check_trajectory(goal: FollowTrajectory, joints: Sequence[str], options: Tra
     Raises:
         GoalRejected: for the first fault.
     """
-    order = _order(goal.trajectory.joint_names, joints)
-    points = goal.trajectory.points
+    return CheckedTrajectory(
+        points_of(goal.trajectory, joints),
+        path_tolerance=_tolerance(goal.path_tolerance, "path_tolerance", options.path_tolerance, joints),
+        goal_tolerance=_tolerance(goal.goal_tolerance, "goal_tolerance", options.goal_tolerance, joints),
+        goal_time_ns=ns(_setting(goal.goal_time, options.goal_time, "goal_time", _LONGEST_S)),
+    )
+
+
+def points_of(trajectory: JointTrajectory, joints: Sequence[str]) -> Points:
+    """The points of a trajectory that ends at rest, in the order of `joints`.
+
+    Raises:
+        GoalRejected: for the first fault, e.g. times that do not increase, or numbers that are missing or not finite.
+    """
+    order, points = _order(trajectory.joint_names, joints), trajectory.points
     if not points:
         raise GoalRejected("the trajectory has no points; it needs at least one")
     times_ns = _times(points)
@@ -65,41 +89,45 @@ def check_trajectory(goal: FollowTrajectory, joints: Sequence[str], options: Tra
         raise GoalRejected("the points have efforts; only positions, velocities and accelerations are followed")
     if accelerations is not None and velocities is None:
         raise GoalRejected("the points have accelerations but no velocities; give both, or positions alone")
-    if velocities is not None and velocities[-1].any():
-        joint = int(np.abs(velocities[-1]).argmax())
-        raise GoalRejected(
-            f"the last point has {joints[joint]} at {velocities[-1, joint]:.6g} rad/s; it must be at rest"
-        )
-    return CheckedTrajectory(
-        times_ns,
-        positions,
-        velocities,
-        accelerations,
-        path_tolerance=_tolerance(goal.path_tolerance, "path_tolerance", options.path_tolerance, joints),
-        goal_tolerance=_tolerance(goal.goal_tolerance, "goal_tolerance", options.goal_tolerance, joints),
-        goal_time_ns=ns(_setting(goal.goal_time, options.goal_time, "goal_time", _LONGEST_S)),
-    )
+    if velocities is not None:
+        check_rest(velocities[-1], "last", joints)
+    return Points(times_ns, positions, velocities, accelerations)
 
 
-def check_plausible(goal: CheckedTrajectory, joints: Sequence[str], velocity: Vector, acceleration: Vector) -> None:
-    """Refuse velocities and accelerations of points that are far beyond the limits of the joints, each shape (J,).
+def check_rest(velocities: Vector, which: str, joints: Sequence[str]) -> None:
+    """Refuse a first or last point that is not at rest, by its velocities [rad/s], shape (J,).
 
     Raises:
-        GoalRejected: for the first one.
+        GoalRejected: for the joint that moves fastest.
     """
-    for what, values, limits in (
-        ("velocities", goal.velocities, velocity),
-        ("accelerations", goal.accelerations, acceleration),
+    joint = int(np.abs(velocities).argmax())
+    if abs(velocities[joint]) > STILL:
+        raise GoalRejected(
+            f"the {which} point has {joints[joint]} at {velocities[joint]:.6g} rad/s; it must be at rest"
+        )
+
+
+def check_rates(points: Points, joints: Sequence[str], velocity: Vector, acceleration: Vector, most: float) -> None:
+    """Refuse velocities and accelerations of points that are beyond the limits of the joints, each shape (J,).
+
+    Args:
+        points: the points.
+        joints: names of their joints.
+        velocity: limits [rad/s].
+        acceleration: limits [rad/s^2].
+        most: largest permitted share of the limits.
+
+    Raises:
+        GoalRejected: for the joint that exceeds a limit most.
+    """
+    for what, unit, values, limits in (
+        ("a velocity", "rad/s", points.velocities, velocity),
+        ("an acceleration", "rad/s²", points.accelerations, acceleration),
     ):
-        if values is None:
-            continue
-        beyond = np.abs(values) > _PLAUSIBLE * limits
-        if beyond.any():
-            number, joint = np.argwhere(beyond)[0]
-            raise GoalRejected(
-                f"point {number} has {values[number, joint]:.6g} among its {what}, for {joints[joint]}, whose limit is "
-                f"{limits[joint]:.6g}"
-            )
+        if values is not None and not (np.abs(values) <= most * limits).all():
+            number, joint = np.unravel_index(int((np.abs(values) / limits).argmax()), values.shape)
+            fault = f"{what} of {values[number, joint]:.4g} {unit}; its limit is {limits[joint]:.4g} {unit}"
+            raise GoalRejected(f"point {number} of the trajectory gives {joints[int(joint)]} {fault}")
 
 
 def check_positions(
@@ -197,9 +225,11 @@ def _field(rows: Sequence[Vector], name: str, order: Sequence[int]) -> Vector | 
         if row.shape != (len(order),):
             raise GoalRejected(f"point {index} has {name} {row.tolist()}; it must be a list of {len(order)} numbers")
     values = np.stack(rows)
-    if not np.isfinite(values).all():
-        index, joint = np.argwhere(~np.isfinite(values))[0]
-        raise GoalRejected(f"point {index} has {values[index, joint]} among its {name}; each must be a finite number")
+    wrong = ~(np.abs(values) <= _LARGEST)  # so that NaN is wrong
+    if wrong.any():
+        index, joint = np.argwhere(wrong)[0]
+        found = f"point {index} has {values[index, joint]:g} among its {name}"
+        raise GoalRejected(f"{found}; each must be a finite number, up to {_LARGEST:g}")
     return values[:, order]
 
 

@@ -18,7 +18,8 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ibrobot_core.api import JointTrajectory, PlanCode, PlanningError, Robot, Vector, ns, seconds
+from ibrobot_core.api import GoalRejected, JointTrajectory, PlanCode, PlanningError, Robot, Vector, ns, seconds
+from ibrobot_planning.executors.trajectory_goal import Points, check_rates, check_rest, points_of
 from ibrobot_planning.planners.timing import LONGEST_S, Motion, evaluated, motion_of, quintics, trajectory_of
 
 START_RAD = 0.01
@@ -27,12 +28,8 @@ MOVING_START_RAD = 0.1
 """The same for a trajectory that takes over from another one, whose point at time 0 is not used."""
 MOST_POINTS = 2000
 """Most points of a trajectory from outside: the control process reads them between two ticks."""
-_PLAUSIBLE = 1e6
-"""Largest number of a trajectory's points, in whatever unit: its sums stay finite."""
 _SAME_RAD = 1e-6
 """A start this near to the robot needs no motion to it."""
-_STILL = 1e-6
-"""Velocities [rad/s] that count as rest."""
 _MORE = 1.01
 """Allowed excess of the limits of velocity and acceleration, for rounding."""
 _BEYOND_RAD = 1e-5
@@ -43,20 +40,6 @@ _JUMP = 1e-3
 """Jumps of the acceleration, as a share of its limit, that need no further points."""
 _QUINTIC_SPEED, _QUINTIC_RATE = 1.875, 5.7736
 """Peak velocity and acceleration of a quintic from rest to rest, for a unit of distance in unit time."""
-
-
-@attrs.frozen(eq=False)
-class _Points:
-    """Points of a trajectory: N points of J joints."""
-
-    times_ns: NDArray[np.int64]
-    """Strictly increasing from 0, shape (N,)."""
-    positions: Vector
-    """[rad], shape (N, J)."""
-    velocities: Vector | None
-    """[rad/s], shape (N, J)."""
-    accelerations: Vector | None
-    """[rad/s^2], shape (N, J)."""
 
 
 @attrs.frozen(eq=False)
@@ -104,8 +87,13 @@ def completed(trajectory: JointTrajectory, start: Start, robot: Robot, period_ns
     """
     names = trajectory.joint_names
     order = robot.indices(names)
-    given = _points(trajectory, start)
-    _check_given(given, robot, order, names)
+    try:
+        given = points_of(trajectory, names)
+        if given.velocities is not None and given.times_ns[0] == 0 and start.velocity is None:
+            check_rest(given.velocities[0], "first", names)
+        check_rates(given, names, robot.max_velocity[order], robot.max_acceleration[order], _MORE)
+    except GoalRejected as error:
+        raise _invalid(str(error)) from None
     points = _from_robot(given, start, robot, order, names, period_ns)
     made = motion_of(trajectory)
     if made is None or not _is_whole(made, start):
@@ -123,70 +111,9 @@ def _is_whole(made: Motion, start: Start) -> bool:
     return bool(begins and at_rest)
 
 
-def _points(trajectory: JointTrajectory, start: Start) -> _Points:
-    """The checked points as arrays."""
-    points, names = trajectory.points, trajectory.joint_names
-    if not points:
-        raise _invalid("the trajectory has no points; it needs two, or one after time 0")
-    if any(point.effort.size for point in points):
-        raise _invalid("the trajectory has efforts; only positions, velocities and accelerations are followed")
-    times = [point.time_from_start_ns for point in points]
-    for number, time in enumerate(times):
-        if time < 0 or (number and time <= times[number - 1]):
-            raise _invalid(f"point {number} of the trajectory is at {time} ns; times must increase from 0 on")
-    if times[-1] == 0:
-        raise _invalid("the last point of the trajectory is at time 0, which leaves no time to reach it")
-    positions = _field([point.positions for point in points], "positions", len(names))
-    if positions is None:
-        raise _invalid("the points of the trajectory have no positions; every point needs them")
-    velocities = _field([point.velocities for point in points], "velocities", len(names))
-    accelerations = _field([point.accelerations for point in points], "accelerations", len(names))
-    if accelerations is not None and velocities is None:
-        raise _invalid("the trajectory has accelerations but no velocities; give both, or positions alone")
-    if velocities is not None:
-        for number in (0, -1) if times[0] == 0 and start.velocity is None else (-1,):
-            if np.abs(velocities[number]).max() > _STILL:
-                joint = int(np.abs(velocities[number]).argmax())
-                where = "ends" if number else "begins"
-                raise _invalid(
-                    f"the trajectory {where} with {names[joint]} at {velocities[number, joint]:.6g} rad/s; it must"
-                    f" {where[:-1]} at rest"
-                )
-    return _Points(np.array(times, dtype=np.int64), positions, velocities, accelerations)
-
-
-def _field(rows: list[Vector], name: str, number: int) -> Vector | None:
-    """One field of all points, shape (N, J); None if no point has it."""
-    if not any(row.size for row in rows):
-        return None
-    for index, row in enumerate(rows):
-        if row.shape != (number,):
-            raise _invalid(f"point {index} of the trajectory has {row.size} {name}, not {number}")
-        # Written so that NaN fails it.
-        if not (np.abs(row) <= _PLAUSIBLE).all():
-            raise _invalid(f"point {index} of the trajectory has {name} that are not finite, or beyond {_PLAUSIBLE:g}")
-    return np.array(rows)
-
-
-def _check_given(points: _Points, robot: Robot, order: NDArray[np.intp], names: tuple[str, ...]) -> None:
-    """Check the velocities and accelerations that a trajectory states for its points.
-
-    Raises:
-        PlanningError: for the joint that exceeds a limit most.
-    """
-    for what, unit, values, limits in (
-        ("a velocity", "rad/s", points.velocities, robot.max_velocity[order]),
-        ("an acceleration", "rad/s²", points.accelerations, robot.max_acceleration[order]),
-    ):
-        if values is not None and not (np.abs(values) <= _MORE * limits).all():
-            number, joint = np.unravel_index(int((np.abs(values) / limits).argmax()), values.shape)
-            fault = f"{what} of {values[number, joint]:.4g} {unit}; its limit is {limits[joint]:.4g} {unit}"
-            raise _invalid(f"point {number} of the trajectory gives {names[int(joint)]} {fault}")
-
-
 def _from_robot(
-    points: _Points, start: Start, robot: Robot, order: NDArray[np.intp], names: tuple[str, ...], period_ns: int
-) -> _Points:
+    points: Points, start: Start, robot: Robot, order: NDArray[np.intp], names: tuple[str, ...], period_ns: int
+) -> Points:
     """The points, after a motion from where the robot is to the first one.
 
     Raises:
@@ -197,7 +124,7 @@ def _from_robot(
         _check_begin(points.positions[0], start, names)
         away = np.abs(points.positions[0] - start.position)
         if start.velocity is not None or away.max() <= _SAME_RAD:
-            points = _Points(
+            points = Points(
                 points.times_ns[1:],
                 points.positions[1:],
                 *(None if field is None else field[1:] for field in (points.velocities, points.accelerations)),
@@ -216,7 +143,7 @@ def _from_robot(
     if start.acceleration is not None:
         firsts = *firsts[:2], start.acceleration
     fields = points.positions, points.velocities, points.accelerations
-    return _Points(
+    return Points(
         np.concatenate([[0], points.times_ns + later_ns]),
         *(None if field is None else np.vstack([first, field]) for first, field in zip(firsts, fields, strict=True)),  # type: ignore[arg-type]
     )
@@ -263,7 +190,7 @@ def _spline_velocities(times_ns: NDArray[np.int64], positions: Vector, first: Ve
     return velocities
 
 
-def _smooth(points: _Points, start: Start, max_acceleration: Vector, period_ns: int) -> Motion:
+def _smooth(points: Points, start: Start, max_acceleration: Vector, period_ns: int) -> Motion:
     """The points as one motion whose acceleration does not jump; it begins with that of `start` and ends without."""
     velocities = points.velocities
     if velocities is None:
@@ -286,7 +213,7 @@ def _smooth(points: _Points, start: Start, max_acceleration: Vector, period_ns: 
     return Motion(times[kept] / ns(1.0), *(column[kept] for column in values))
 
 
-def _accelerations(points: _Points, velocities: Vector) -> tuple[Vector, Vector]:
+def _accelerations(points: Points, velocities: Vector) -> tuple[Vector, Vector]:
     """Accelerations at the start and at the end of each piece between points [rad/s^2], both shape (N - 1, J)."""
     if points.accelerations is not None:
         return points.accelerations[:-1], points.accelerations[1:]
@@ -297,7 +224,7 @@ def _accelerations(points: _Points, velocities: Vector) -> tuple[Vector, Vector]
 
 
 def _at(
-    points: _Points, velocities: Vector, left: Vector, right: Vector, pieces: NDArray[np.intp], at_ns: NDArray[np.int64]
+    points: Points, velocities: Vector, left: Vector, right: Vector, pieces: NDArray[np.intp], at_ns: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], Vector, Vector, Vector]:
     """Times, positions, velocities and accelerations of the quintics at a time [ns] within each of some pieces."""
     h = (np.diff(points.times_ns)[pieces] / ns(1.0))[:, None]
