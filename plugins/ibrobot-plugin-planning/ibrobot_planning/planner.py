@@ -164,9 +164,10 @@ class Planner(ABC):
         """
 
     def blocked(self, trajectory: JointTrajectory, others: Mapping[str, float], from_ns: int = 0) -> str:
-        """What a trajectory touches in the present world, in words; empty if nothing, or if the planner knows no world.
+        """What a trajectory touches of what only the planner knows, in words; empty if nothing.
 
-        It is called during a motion, every 20 ms and from another thread than `plan`.
+        The run checks trajectories against its own world. It calls this in addition, before a motion and during it,
+        every 20 ms and from another thread than `plan`.
 
         Args:
             trajectory: with velocities and accelerations.

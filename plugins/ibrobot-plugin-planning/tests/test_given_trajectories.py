@@ -17,6 +17,8 @@ from ibrobot_planning.execution.source import EXECUTE, GO_TO
 from ibrobot_planning.goals.grammar import Target
 from ibrobot_planning.planner import PlanRequest, PlanResult
 from ibrobot_planning.planners.completion import MOST_POINTS, Start, completed
+from ibrobot_planning.planners.options import RrtConnectOptions
+from ibrobot_planning.planners.paths import FreePaths
 from ibrobot_planning.planners.timing import LONGEST_S
 from ibrobot_planning.suite import FakePlanner
 
@@ -28,10 +30,11 @@ from ibrobot_core.api import (
     PlanCode,
     PlanningError,
     Robot,
+    SteppedClock,
     Vector,
     ns,
 )
-from ibrobot_core.app import Runtime, Spline
+from ibrobot_core.app import Bus, Runtime, Spline
 
 from .conftest import Make
 from .table_arm import ARM, WALL, make_planner
@@ -265,7 +268,9 @@ def test_complete_trajectory_stays_as_it_is():
     assert completed(wanted, Start(np.zeros(1)), ONE, PERIOD_NS) is wanted
 
 
-def test_planner_proves_nothing_of_an_incomplete_trajectory(tmp_path: Path):
+def test_nothing_is_proved_of_an_incomplete_trajectory(tmp_path: Path):
     """A trajectory whose course is unknown is blocked, so that nothing runs unwatched."""
     planner = make_planner(tmp_path, WALL)
-    assert "without velocities and accelerations" in planner.blocked(trajectory((0, LEFT), (1, LEFT)), {})
+    paths = FreePaths(lambda: planner.arm, Bus(SteppedClock(0)), None)
+    touched = paths.blocked(trajectory((0, LEFT), (1, LEFT)), {}, RrtConnectOptions())
+    assert "without velocities and accelerations" in touched

@@ -13,12 +13,13 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from ibrobot_kinematics.clearance import CLEARANCE
+from ibrobot_planning.execution.door import GoalDoor
 from ibrobot_planning.execution.motions import Execution
 from ibrobot_planning.execution.source import GO_TO, MOVE_TO_CONFIGURATION, MOVE_TO_POSE, RESULT
 from ibrobot_planning.suite import FakePlanner
 from ibrobot_planning.world.objects import SNAPSHOT, World
 
-from ibrobot_core.api import HardwareError, IbrobotError, PlanCode, PlanningError
+from ibrobot_core.api import HardwareError, IbrobotError, JointTrajectory, PlanCode, PlanningError
 from ibrobot_core.app import ConfigError, RequestError, Runtime, Service
 
 from .conftest import Make
@@ -118,11 +119,11 @@ def test_object_may_touch_the_floor_and_clouds_that_come_and_go(run: Run):
 
 
 def test_motion_that_cannot_be_checked_stops(run: Run, monkeypatch: pytest.MonkeyPatch):
-    def blocked(self: Execution) -> str:
+    def blocked(self: GoalDoor, trajectory: JointTrajectory, from_ns: int = 0) -> str:
         raise PlanningError("the world makes no sense")
 
     runtime, number = moving(run)
-    monkeypatch.setattr(Execution, "blocked", blocked)
+    monkeypatch.setattr(GoalDoor, "blocked", blocked)
     result = finish(runtime, number)
     assert result.code is PlanCode.MOTION_PLAN_INVALIDATED_BY_ENVIRONMENT_CHANGE
     assert "the motion cannot be checked: the world makes no sense" in result.message

@@ -159,8 +159,10 @@ def test_equal_seeds_give_equal_blends(run):
     np.testing.assert_array_equal(ride(), ride())
 
 
-def test_obstacle_that_appears_stops_the_arm_before_it(run):
-    runtime = run()
+@pytest.mark.parametrize("mode", ["plan", "joint"])
+def test_obstacle_that_appears_stops_the_arm_before_it(run, mode: str):
+    """Also a motion of a planner that knows no obstacles."""
+    runtime = run(mode=mode)
     number = runtime.session.bus.call(GO_TO, "left")
     commands = step(runtime, 15)
     box = {"shape": "box", "size": [0.2, 0.02, 0.3], "position": [0.09, 0.13, 0.2], "rpy": [0, 0, 1.0]}

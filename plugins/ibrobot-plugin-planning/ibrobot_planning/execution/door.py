@@ -29,6 +29,7 @@ from ibrobot_core.api import (
     seconds,
 )
 from ibrobot_core.app import ControlState, GuardedRun, RunView, SessionWorker
+from ibrobot_planning.planner import Planner
 from ibrobot_planning.planners.completion import Start, check_size, completed
 from ibrobot_planning.planners.options import GoalCheckOptions, RrtConnectOptions
 from ibrobot_planning.planners.timing import Motion, motion_of
@@ -103,8 +104,10 @@ class GoalDoor(SessionWorker):
         self._command: Vector | None = None
         self._moved_ns = np.full(len(self._robot.joints), -ns(1e6), dtype=np.int64)
         """When the command of each joint last changed [ns], shape (J,); long ago if it has not."""
-        self.watched_by: Callable[[str], bool] = lambda goal_id: False
-        """Whether its sender stops a goal if the world comes into its way."""
+        self.planner: Planner | None = None
+        """The planner of the mode, which may know more of the world than the run."""
+        self.stops_before: Callable[[str, str, PlanCode], bool] = lambda goal_id, touched, code: False
+        """Called with a goal, what has come into its way, and MoveIt's code; returns whether its sender stops it."""
         _DOORS[session] = self
 
     @override
@@ -161,8 +164,32 @@ class GoalDoor(SessionWorker):
         if timeout_s:
             self.pause(min(timeout_s, _WATCH_S))
         for name, track in list(self._tracks.items()):
-            if track.begin_ns is not None and track.trajectory is not None and not self.watched_by(track.goal_id):
-                self._watch(name, track, track.trajectory, track.begin_ns)
+            if track.trajectory is not None:
+                self._watch(name, track, track.trajectory)
+
+    def blocked(self, trajectory: JointTrajectory, from_ns: int = 0) -> str:
+        """What a trajectory touches in the present world, in words; empty if nothing, or if no world is known.
+
+        Args:
+            trajectory: with velocities and accelerations; other joints are where they are commanded.
+            from_ns: where it begins [ns]; what lies before is past.
+
+        Raises:
+            PlanningError: if the world cannot be trusted, e.g. because a cloud is too old.
+        """
+        others = self._others()
+        if self._is_checked() and (touched := self._paths.blocked(trajectory, others, self._margins(), from_ns)):
+            return touched
+        return "" if self.planner is None else self.planner.blocked(trajectory, others, from_ns)
+
+    def check_free(self, trajectory: JointTrajectory) -> None:
+        """Check a trajectory against the present world.
+
+        Raises:
+            PlanningError: if it is not free.
+        """
+        if touched := self.blocked(trajectory):
+            raise PlanningError(f"the trajectory is not free: {touched}", PlanCode.INVALID_MOTION_PLAN)
 
     def complete(self, trajectory: JointTrajectory) -> None:
         """Take note that a trajectory was completed from where the robot is, and is within the limits."""
@@ -191,7 +218,7 @@ class GoalDoor(SessionWorker):
             raise GoalRejected(f"executor {executor!r} is not active in mode {self.session.mode}")
         with self._door:
             if goal.takes_over is not None or any(known is goal.trajectory for known in self._complete):
-                self._check_free(goal.trajectory)
+                self.check_free(goal.trajectory)
                 self._send(executor, goal_id, goal, send)
             else:
                 self._complete_and_send(executor, goal_id, goal, send)
@@ -205,7 +232,7 @@ class GoalDoor(SessionWorker):
         for ahead_s in _AHEAD_S:
             start, takes_over = self._start(executor, trajectory.joint_names, ahead_s)
             whole = completed(trajectory, start, self._robot, self._period_ns)
-            self._check_free(whole)
+            self.check_free(whole)
             try:
                 self._send(executor, goal_id, attrs.evolve(goal, trajectory=whole, **takes_over), send)
             except HardwareError as error:
@@ -269,15 +296,6 @@ class GoalDoor(SessionWorker):
         command = state.command if state is not None else self.session.measured().position
         return dict(zip(self._robot.joint_names, command.tolist(), strict=True))
 
-    def _check_free(self, trajectory: JointTrajectory) -> None:
-        """Check a trajectory against the present world.
-
-        Raises:
-            PlanningError: if it is not free.
-        """
-        if self._is_checked() and (touched := self._paths.blocked(trajectory, self._others(), self._margins())):
-            raise PlanningError(f"the trajectory is not free: {touched}", PlanCode.INVALID_MOTION_PLAN)
-
     def _check_granted(self, trajectory: JointTrajectory) -> None:
         """Check a trajectory against what is granted to an agent.
 
@@ -322,17 +340,21 @@ class GoalDoor(SessionWorker):
                     self._tracks[executor] = before
             raise
 
-    def _watch(self, name: str, track: Track, trajectory: JointTrajectory, begin_ns: int) -> None:
-        """Stop a motion that the present world blocks."""
-        state = self.session.state
-        if state is None or not self._is_checked():
+    def _watch(self, name: str, track: Track, trajectory: JointTrajectory) -> None:
+        """Have a motion stop that the present world blocks."""
+        state, code = self.session.state, PlanCode.MOTION_PLAN_INVALIDATED_BY_ENVIRONMENT_CHANGE
+        if state is None:
             return
+        passed_ns = 0 if track.begin_ns is None else max(0, state.stamp_ns - track.begin_ns)
         try:
-            passed_ns = max(0, state.stamp_ns - begin_ns)
-            touched = self._paths.blocked(trajectory, self._others(), self._margins(), passed_ns)
+            touched = self.blocked(trajectory, passed_ns)
         except PlanningError as error:
             touched = f"the motion cannot be checked: {error}"
+            if error.code is PlanCode.SENSOR_INFO_STALE:
+                code = error.code
         if not touched or self._tracks.get(name) is not track:
+            return
+        if self.stops_before(track.goal_id, touched, code) or self._tracks.get(name) is not track:
             return
         self.session.log.warning("%s stops before an obstacle: %s", name, touched)
         track.trajectory = None

@@ -24,7 +24,6 @@ from ibrobot_core.api import (
 )
 from ibrobot_core.app import GoalRun, RunView
 from ibrobot_planning.execution.door import GoalDoor, Track
-from ibrobot_planning.planner import Planner
 from ibrobot_planning.planners.blend import Limits, braking, cut, joined
 from ibrobot_planning.planners.timing import Motion, motion_of, trajectory_of
 
@@ -55,13 +54,11 @@ class Execution:
 
     Args:
         session: the run.
-        planner: checks motions for collisions.
-        door: through which its goals pass.
+        door: through which its goals pass, and which checks motions for collisions.
     """
 
-    def __init__(self, session: GoalRun, planner: Planner, door: GoalDoor) -> None:
+    def __init__(self, session: GoalRun, door: GoalDoor) -> None:
         self._session = session
-        self._planner = planner
         self._door = door
         self._lock = threading.RLock()
         self._tracks: dict[str, Track] = {}
@@ -146,6 +143,16 @@ class Execution:
             self._number, self._stops = number, stops
             return rest
 
+    def check(self, goals: Mapping[str, ExecutorGoal]) -> None:
+        """Check goals against the present world, as when they are sent to executors at rest.
+
+        Raises:
+            PlanningError: if one is not free.
+        """
+        for goal in goals.values():
+            if isinstance(goal, FollowTrajectory):
+                self._door.check_free(goal.trajectory)
+
     def follow(self, goals: Mapping[str, ExecutorGoal], *, blends: bool) -> None:
         """Add the next motion to the braking one.
 
@@ -189,32 +196,16 @@ class Execution:
             del self._tracks[name]
         return "" if state == "succeeded" else f"{name} {state}: {event['message']}"
 
-    def blocked(self) -> str:
-        """What the rest of a motion touches in the present world; empty if nothing."""
-        state = self._session.state
-        if state is None:
-            return ""
-        others = dict(zip(self._session.config.robot.joint_names, state.command.tolist(), strict=True))
-        with self._lock:
-            tracks = list(self._tracks.values())
-        for track in tracks:
-            if track.trajectory is not None:
-                passed_ns = 0 if track.begin_ns is None else max(0, state.stamp_ns - track.begin_ns)
-                if touched := self._planner.blocked(track.trajectory, others, passed_ns):
-                    return touched
-        return ""
-
     def touched(self) -> str:
         """What the arm touches or is too near to at present; empty if nothing."""
         session, position = self._session, commanded(self._session)
         robot = session.config.robot
-        others = dict(zip(robot.joint_names, position.tolist(), strict=True))
         for name in session.config.control_modes[session.mode].executors:
             executor = session.config.executors[name]
             if executor.goals == "trajectory":
                 here, rest = position[robot.indices(executor.joints)], np.zeros(len(executor.joints))
                 points = tuple(JointTrajectoryPoint(stamp, here, rest, rest) for stamp in (0, ns(0.01)))
-                if touched := self._planner.blocked(JointTrajectory(Header(), executor.joints, points), others):
+                if touched := self._door.blocked(JointTrajectory(Header(), executor.joints, points)):
                     return touched
         return ""
 
@@ -277,11 +268,10 @@ class Execution:
         limits = Limits(
             robot.lower[order], robot.upper[order], robot.max_velocity[order], robot.max_acceleration[order]
         )
-        others = dict(zip(robot.joint_names, state.command.tolist(), strict=True))
         for way in joined(old, new, begin_s, limits):
             # Only the overlap needs a check: the planner has checked the rest of the new motion.
             overlap = trajectory_of(cut(way, old.duration - begin_s), running.joint_names, goal.header.stamp_ns)
-            if not self._planner.blocked(overlap, others):
+            if not self._door.blocked(overlap):
                 blend = trajectory_of(way, running.joint_names, goal.header.stamp_ns)
                 self._door.free(blend)
                 goal_there = FollowTrajectory(blend, takes_over=track.goal_id, at_ns=ns(begin_s))

@@ -227,24 +227,21 @@ class GoalPlans:
                 first, scalings = start[robot.indices(joints)], (target.velocity_scaling, target.acceleration_scaling)
                 planned = self.planned(PlanRequest(joints, first, goal, *scalings, others), era=era)
                 trajectory = planned.trajectory
-            goals[name] = FollowTrajectory(self._checked(trajectory, start, others))
+            goals[name] = FollowTrajectory(self._completed(trajectory, start))
         return goals, planned
 
-    def _checked(self, trajectory: JointTrajectory, start: Vector, others: Mapping[str, float]) -> JointTrajectory:
-        """Complete a trajectory, and check it for limits and for collisions in the present world.
+    def _completed(self, trajectory: JointTrajectory, start: Vector) -> JointTrajectory:
+        """Complete a trajectory from where the joints are, or will be.
 
         Raises:
-            PlanningError: if it fails a check.
+            PlanningError: as `completed`.
         """
         robot, config = self._session.config.robot, self._session.config
         order = robot.indices(trajectory.joint_names)
         begin = Start(start[order])
         if self._session.state is not None and np.array_equal(start, commanded(self._session)):
             begin = Start(start[order], measured=self._session.measured().position[order])
-        whole = completed(trajectory, begin, robot, ns(1.0 / config.control.rate_hz))
-        if touched := self.planner.blocked(whole, others):
-            raise PlanningError(f"the trajectory is not free: {touched}", PlanCode.INVALID_MOTION_PLAN)
-        return whole
+        return completed(trajectory, begin, robot, ns(1.0 / config.control.rate_hz))
 
     def planned(self, request: PlanRequest, *, era: int | None = None) -> PlanResult:
         """Plan by the mode's planner, one request at a time; what is to move comes before what is not.

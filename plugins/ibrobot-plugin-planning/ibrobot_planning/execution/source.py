@@ -126,8 +126,6 @@ _STATUS_NS = ns(0.1)
 _GLANCE_S = 0.5
 _BUSY_S = 0.01
 """Longest wait of a unit of work while the robot moves [s]."""
-_WATCH_S = 0.02
-"""Interval at which a motion is checked against the present world [s]."""
 _ENDED = MoveResult(False, "the mode or the run ended, or control was reset", 0.0, "CANCELLED", PlanCode.PREEMPTED)
 _STILL_RAD = 1e-4
 """Commands that change less between two checks count as at rest."""
@@ -188,8 +186,6 @@ class PlannerSource(SourceWorker):
         """Held while a goal is handed over, so that the last one is of the newest era."""
         self._choosing = threading.Lock()
         """Held while the move under way changes."""
-        self._unwatched = threading.Event()
-        """Set to end the watching thread."""
         self._last_state: ControlState | None = None
         self._era = 0, 0
         """Numbers of the emergency stops and of the generation that topics of goals were last read in."""
@@ -217,9 +213,7 @@ class PlannerSource(SourceWorker):
     def setup(self) -> None:
         planner = self._plans.make()
         self.on_end.callback(planner.close)
-        door = door_of(self.session)
-        self._execution = Execution(self.session, planner, door)
-        door.watched_by = self._execution.follows
+        self._execution = Execution(self.session, door_of(self.session))
         self._topics = {
             CMD_POSE: self.session.bus.subscribe(CMD_POSE, 1, PoseStamped, Pose),
             CMD_GOAL: self.session.bus.subscribe(CMD_GOAL, 1, String),
@@ -228,12 +222,6 @@ class PlannerSource(SourceWorker):
             self.on_end.callback(subscription.close)
         self.on_end.callback(self._drop_all)
         planner.load()
-        if not self.session.request.lockstep:
-            self._unwatched.clear()
-            watcher = threading.Thread(target=self._watch_on, name=f"{self.name} watch", daemon=True)
-            watcher.start()
-            self.on_end.callback(watcher.join)
-            self.on_end.callback(self._unwatched.set)
 
     @override
     def begin_mode(self, seed: int) -> None:
@@ -242,12 +230,15 @@ class PlannerSource(SourceWorker):
         self._drain()
         self._era = self.session.stops, self.session.generation
         self._forget()
+        door = door_of(self.session)
+        door.planner, door.stops_before = self._plans.planner, self._stop_before
         for service, handler in self._services.items():
             self.session.bus.serve(service, handler)
         self._show("idle")
 
     @override
     def end_mode(self) -> None:
+        door_of(self.session).planner = None
         for service in self._services:
             self.session.bus.unserve(service)
         self._forget()
@@ -290,8 +281,6 @@ class PlannerSource(SourceWorker):
             if not self.active:
                 return
             self._take_topics()
-            if self.session.request.lockstep:
-                self._watch()
             if self._move is not None:
                 self._following(self._move, self._execution.step)
                 self._end_at_rest(self._move)
@@ -467,6 +456,7 @@ class PlannerSource(SourceWorker):
         self._show("executing")
         try:
             goals, new.planned = self._plans.plan(new.target, rest, era=new.era)
+            self._execution.check(goals)
         except PlanningError as error:
             self._execution.stop(new.number)
             self._finish(new, _outcome(error), error.code, str(error))
@@ -484,31 +474,16 @@ class PlannerSource(SourceWorker):
             move.failures.append(str(error))
             self._execution.stop(move.number)
 
-    def _watch(self) -> None:
-        """Stop a motion that the present world blocks."""
-        move = self._move
-        if move is None or move.dropped or move.blocked:
-            return
-        code = PlanCode.SUCCESS
-        try:
-            blocked = self._execution.blocked()
-        except PlanningError as error:
-            blocked = f"the motion cannot be checked: {error}"
-            code = error.code
-        if blocked:
-            with self._choosing:
-                if move is self._move:
-                    move.blocked = blocked
-                    if code is PlanCode.SENSOR_INFO_STALE:
-                        move.blocked_code = code
-                    self._execution.stop(move.number)
-
-    def _watch_on(self) -> None:
-        try:
-            while not self._unwatched.wait(_WATCH_S):
-                self._watch()
-        except Exception as error:  # noqa: BLE001 - an unwatched motion must not go on
-            self.session.fail(self.name, error)
+    def _stop_before(self, goal_id: str, touched: str, code: PlanCode) -> bool:
+        """Stop the move under way before what has come into its way; False if the goal is not of this source."""
+        if not self._execution.follows(goal_id):
+            return False
+        with self._choosing:
+            move = self._move
+            if move is not None and not move.dropped and not move.blocked:
+                move.blocked, move.blocked_code = touched, code
+                self._execution.stop(move.number)
+        return True
 
     def _awaits_world(self) -> bool:
         """Whether the first message of a cloud may still come, shortly after the start."""

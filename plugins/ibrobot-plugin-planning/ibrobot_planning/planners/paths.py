@@ -54,29 +54,18 @@ class FreePaths:
 
     Args:
         arm: the arm, once it is loaded.
-        bus: serves the world; None without a run.
+        bus: serves the world.
         floor: height of the floor for margins that do not say it [m]; None: there is none.
-        world: the objects, if the run has no section `world`.
     """
 
-    def __init__(
-        self, arm: Callable[[], Arm], bus: Bus | None, floor: float | None, world: Callable[[], World] = World
-    ) -> None:
-        self._arm, self._bus, self._floor, self._world = arm, bus, floor, world
+    def __init__(self, arm: Callable[[], Arm], bus: Bus, floor: float | None) -> None:
+        self._arm, self._bus, self._floor = arm, bus, floor
         self._free: deque[tuple[JointTrajectory, World]] = deque(maxlen=16)
         """Trajectories, each with the world in which it is free."""
 
     def snapshot(self, margins: Margins) -> World:
         """The present world, with the floor."""
-        world = world_of(self._bus, self._world)
-        floor = self._floor if margins.floor is None else margins.floor
-        named = world.objects.get(FLOOR)
-        if floor is None or (named is not None and isinstance(named.shape, Plane)):
-            return world
-        # Another object of this name does not take the table's place.
-        return world.add(
-            FLOOR if named is None else f"{FLOOR} of the planner", WorldObject(Plane(), Pose(Vector3(0.0, 0.0, floor)))
-        )
+        return with_floor(world_of(self._bus), self._floor if margins.floor is None else margins.floor)
 
     def note(self, trajectory: JointTrajectory, world: World) -> None:
         """Remember that a trajectory, or all of it that is still new, is free in a world."""
@@ -108,6 +97,17 @@ class FreePaths:
                 return ""
             if from_ns and self.snapshot(margins) != world:
                 return ""  # it is under way: the next check, which follows at once, begins with what comes first
+
+
+def with_floor(world: World, floor: float | None) -> World:
+    """The world with a floor at a height [m], unless it has one; None: no floor."""
+    named = world.objects.get(FLOOR)
+    if floor is None or (named is not None and isinstance(named.shape, Plane)):
+        return world
+    # Another object of this name does not take the table's place.
+    return world.add(
+        FLOOR if named is None else f"{FLOOR} of the planner", WorldObject(Plane(), Pose(Vector3(0.0, 0.0, floor)))
+    )
 
 
 def collisions(

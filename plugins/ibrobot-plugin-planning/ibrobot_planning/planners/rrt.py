@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import override
 
@@ -11,7 +11,7 @@ import attrs
 import numpy as np
 from ibrobot_kinematics import ToolConstraints, robot_model
 
-from ibrobot_core.api import Context, JointTrajectory, PlanCode, PlanningError, Vector
+from ibrobot_core.api import Context, PlanCode, PlanningError, Vector
 from ibrobot_planning.goals.joints import checked_start, joint_target
 from ibrobot_planning.goals.tool import Candidate, Tool
 from ibrobot_planning.planner import (
@@ -31,13 +31,13 @@ from ibrobot_planning.planner import (
 from ibrobot_planning.planners.constrained import ConstrainedChecks, ConstrainedSpace
 from ibrobot_planning.planners.linear import linear_path
 from ibrobot_planning.planners.options import RrtConnectOptions
-from ibrobot_planning.planners.paths import CHECK_S, FreePaths, collisions, outwards, sentence
+from ibrobot_planning.planners.paths import CHECK_S, collisions, outwards, sentence, with_floor
 from ibrobot_planning.planners.search import Pace, Space, connect, shortened
 from ibrobot_planning.planners.timing import Motion, resting, timed, trajectory_of
 from ibrobot_planning.world.arm import Arm
 from ibrobot_planning.world.checked_arm import checked_arm
 from ibrobot_planning.world.collision import Collisions
-from ibrobot_planning.world.objects import World
+from ibrobot_planning.world.objects import World, world_of
 
 _RESOLUTIONS_M = (0.05, 0.02, 0.005)
 """Maximum motion of the arm between checks of the search; finer ones follow if the timed motion touches."""
@@ -68,7 +68,7 @@ class RrtConnectPlanner(Planner):
         self._ctx = ctx
         self._arm: Arm | None = None
         self._tool: Tool | None = None
-        self._paths = FreePaths(lambda: self.arm, ctx.bus, ctx.robot.description.floor, lambda: self.world)
+        self._floor = ctx.robot.description.floor if options.floor is None else options.floor
 
     @override
     def load(self) -> None:
@@ -86,18 +86,12 @@ class RrtConnectPlanner(Planner):
     def plan(self, request: PlanRequest) -> PlanResult:
         begun = time.monotonic()
         start = self._check_start(request)
-        world = self._paths.snapshot(self._options)
+        world = with_floor(world_of(self._ctx.bus, lambda: self.world), self._floor)
         checks = collisions(self.arm, world, request.joints, request.others, self._options)
         checks.before = request.check_wanted  # whatever takes time in a search checks for contacts
         deadline = begun + self._options.planning_time
         assert self._tool is not None
-        result = _Plan(self._ctx, self._options, self._tool, request, start, checks, deadline).solve()
-        self._paths.note(result.trajectory, world)
-        return result
-
-    @override
-    def blocked(self, trajectory: JointTrajectory, others: Mapping[str, float], from_ns: int = 0) -> str:
-        return self._paths.blocked(trajectory, others, self._options, from_ns)
+        return _Plan(self._ctx, self._options, self._tool, request, start, checks, deadline).solve()
 
     def _check_start(self, request: PlanRequest) -> Vector:
         robot = self._ctx.robot
