@@ -52,9 +52,6 @@ class CommandSource(Told):
             IbrobotError: if it cannot recover; the fault stays.
         """
 
-    def take_goal(self, event: Mapping[str, Any]) -> None:
-        """Handle a change of state of an executor's goal."""
-
     def described(self) -> Mapping[str, str] | None:
         """Name and weights of the policy that it runs; None without one."""
         return None

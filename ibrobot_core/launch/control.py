@@ -123,7 +123,7 @@ class ControlComponent(Component):
     def _take(self, event: Mapping[str, Any]) -> None:
         session = self._session
         if event["event"] == "goal":
-            for call in (session.command_source.take_goal, *session.on_goal):
+            for call in tuple(session.on_goal):
                 call(event)
         elif event["event"] == "guard":
             session.bus.publish("/guard", String(event["overruled"]), latched=True)

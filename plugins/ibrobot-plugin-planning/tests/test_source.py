@@ -140,9 +140,9 @@ def test_goal_sent_while_the_robot_is_stopped_is_refused(start: Make):
 def test_status_of_an_earlier_goal_does_not_end_the_present_one(start: Make):
     runtime = start(mode="plan", goals=("up",))
     seconds(runtime, 0.1)
-    runtime.session.command_source.take_goal(
-        {"executor": "arm_trajectory", "goal": "0:arm_trajectory", "state": "canceled", "message": "", "result": {}}
-    )
+    event = {"executor": "arm_trajectory", "goal": "0:arm_trajectory", "state": "canceled", "message": "", "result": {}}
+    for call in runtime.session.on_goal:
+        call(event)
     to_the_end(runtime)
     assert runtime.summary()["goals_failed"] == 0
     assert position(runtime)[0] == pytest.approx(0.4, abs=0.03)

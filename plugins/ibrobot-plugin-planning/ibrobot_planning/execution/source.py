@@ -220,6 +220,8 @@ class PlannerSource(SourceWorker):
         }
         for subscription in self._topics.values():
             self.on_end.callback(subscription.close)
+        self.session.on_goal.append(self._take_event)
+        self.on_end.callback(self.session.on_goal.remove, self._take_event)
         self.on_end.callback(self._drop_all)
         planner.load()
 
@@ -255,9 +257,9 @@ class PlannerSource(SourceWorker):
             self._queue.remove(move)
             self._finish(move, "CANCELLED", PlanCode.PREEMPTED, _ENDED.message)
 
-    @override
-    def take_goal(self, event: Mapping[str, Any]) -> None:
-        self._inbox.put(event)
+    def _take_event(self, event: Mapping[str, Any]) -> None:
+        if self.active:
+            self._inbox.put(event)
 
     @override
     def work(self, timeout_s: float) -> None:
