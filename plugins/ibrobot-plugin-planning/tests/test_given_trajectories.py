@@ -12,13 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ibrobot_planning.client import Client
+from ibrobot_planning.execution.door import door_of
 from ibrobot_planning.execution.requests import Execute, GoTo, MoveResult
 from ibrobot_planning.execution.source import EXECUTE, GO_TO
 from ibrobot_planning.goals.grammar import Target
 from ibrobot_planning.planner import PlanRequest, PlanResult
 from ibrobot_planning.planners.completion import MOST_POINTS, Start, completed
-from ibrobot_planning.planners.options import RrtConnectOptions
-from ibrobot_planning.planners.paths import FreePaths
 from ibrobot_planning.planners.timing import LONGEST_S
 from ibrobot_planning.suite import FakePlanner
 
@@ -30,14 +29,13 @@ from ibrobot_core.api import (
     PlanCode,
     PlanningError,
     Robot,
-    SteppedClock,
     Vector,
     ns,
 )
-from ibrobot_core.app import Bus, Runtime, Spline
+from ibrobot_core.app import Runtime, Spline
 
 from .conftest import Make
-from .table_arm import ARM, WALL, make_planner
+from .table_arm import ARM
 from .test_motion import assert_within_limits, command, finish, robot_yaml
 
 WALL_BOX = {"shape": "box", "size": [0.3, 0.02, 0.3], "position": [0.2, 0, 0.15]}
@@ -268,9 +266,7 @@ def test_complete_trajectory_stays_as_it_is():
     assert completed(wanted, Start(np.zeros(1)), ONE, PERIOD_NS) is wanted
 
 
-def test_nothing_is_proved_of_an_incomplete_trajectory(tmp_path: Path):
+def test_nothing_is_proved_of_an_incomplete_trajectory(run):
     """A trajectory whose course is unknown is blocked, so that nothing runs unwatched."""
-    planner = make_planner(tmp_path, WALL)
-    paths = FreePaths(lambda: planner.arm, Bus(SteppedClock(0)), None)
-    touched = paths.blocked(trajectory((0, LEFT), (1, LEFT)), {}, RrtConnectOptions())
+    touched = door_of(run().session).blocked(trajectory((0, LEFT), (1, LEFT)))
     assert "without velocities and accelerations" in touched

@@ -7,7 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, override
+from typing import Any, override
 from weakref import WeakKeyDictionary
 
 import attrs
@@ -32,16 +32,18 @@ from ibrobot_core.app import ControlState, GuardedRun, RunView, SessionWorker
 from ibrobot_planning.planner import Planner
 from ibrobot_planning.planners.completion import Start, check_size, completed
 from ibrobot_planning.planners.options import GoalCheckOptions, RrtConnectOptions
-from ibrobot_planning.planners.timing import Motion, motion_of
+from ibrobot_planning.planners.timing import CHECK_S, Motion, motion_of
 from ibrobot_planning.world.engines import find_engines
-
-if TYPE_CHECKING:
-    from ibrobot_planning.planners.paths import FreePaths, Margins
+from ibrobot_planning.world.objects import World, with_floor, world_of
 
 WORLD = "world"
 """The section whose objects are the world."""
 _AHEAD_S = (0.05, 0.15, 0.4)
 """How far ahead a trajectory takes over from the running one, at each attempt; its check takes a part of the time."""
+_STRIDE = 2
+"""Every second one of the planner's checks is repeated in the present world."""
+_PART_S = 5.0
+"""Part of a long motion that is checked at a time: a change of the world is looked for in between [s]."""
 _WATCH_S = 0.02
 """Interval at which motions are checked against the present world [s]."""
 _GRANTED_S = 0.01
@@ -95,6 +97,8 @@ class GoalDoor(SessionWorker):
         self._loading = threading.Lock()
         self._complete: deque[JointTrajectory] = deque(maxlen=16)
         """Trajectories that a planner's source has completed from where the robot is."""
+        self._free: deque[tuple[JointTrajectory, World]] = deque(maxlen=16)
+        """Trajectories, each with the world in which it is free, or all of it that is still new."""
         self._door = threading.Lock()
         """Held while a goal passes."""
         self._tracks: dict[str, Track] = {}
@@ -147,12 +151,6 @@ class GoalDoor(SessionWorker):
                     self._unchecked = ""
             return not self._unchecked
 
-    @cached_property
-    def _paths(self) -> FreePaths:
-        from ibrobot_planning.planners.paths import FreePaths
-
-        return FreePaths(lambda: self._arm, self.session.bus, self._robot.description.floor)
-
     @property
     def _arm(self) -> Any:
         from ibrobot_planning.world.checked_arm import checked_arm
@@ -178,9 +176,38 @@ class GoalDoor(SessionWorker):
             PlanningError: if the world cannot be trusted, e.g. because a cloud is too old.
         """
         others = self._others()
-        if self._is_checked() and (touched := self._paths.blocked(trajectory, others, self._margins(), from_ns)):
+        touched = self._touched(trajectory, others, from_ns) if self._is_checked() else ""
+        if touched or self.planner is None:
             return touched
-        return "" if self.planner is None else self.planner.blocked(trajectory, others, from_ns)
+        return self.planner.blocked(trajectory, others, from_ns)
+
+    def _touched(self, trajectory: JointTrajectory, others: Mapping[str, float], from_ns: int) -> str:
+        """What a trajectory touches in the world of the run, as `blocked`."""
+        from ibrobot_planning.world.collision import Collisions, outwards, sentence
+
+        world, margins = self._world(), self._margins()
+        if any(known is trajectory and in_world == world for known, in_world in tuple(self._free)):
+            return ""
+        made = motion_of(trajectory)
+        if made is None:
+            return "a trajectory without velocities and accelerations cannot be checked"
+        paddings = {"padding": margins.padding, "self_padding": margins.self_padding}
+        checks = Collisions(self._arm, world, trajectory.joint_names, others, **paddings)
+        begin = begun = min(round(seconds(from_ns) / CHECK_S) * CHECK_S, made.duration)
+        while True:
+            positions = made.sampled(_STRIDE * CHECK_S, begin, begin + _PART_S)[0]
+            leaving = 0
+            if begin == begun:  # contacts at the start may open
+                leaving = outwards(checks, positions) or 0
+            hit = leaving + checks.first_hit_on_path(positions[leaving:])
+            if hit < len(positions):
+                return sentence(checks.contacts(positions[hit]))
+            begin += _PART_S
+            if begin >= made.duration:
+                self._free.append((trajectory, world))
+                return ""
+            if from_ns and self._world() != world:
+                return ""  # it is under way: the next check, which follows at once, begins with what comes first
 
     def check_free(self, trajectory: JointTrajectory) -> None:
         """Check a trajectory against the present world.
@@ -198,7 +225,7 @@ class GoalDoor(SessionWorker):
     def free(self, trajectory: JointTrajectory) -> None:
         """Take note that a trajectory that takes over from the running one is free and within the limits."""
         if self._is_checked():
-            self._paths.note(trajectory, self._paths.snapshot(self._margins()))
+            self._free.append((trajectory, self._world()))
 
     def take(self, executor: str, goal_id: str, goal: ExecutorGoal, send: Send) -> None:
         """Let a goal pass. See `Session.goal_door`.
@@ -283,7 +310,12 @@ class GoalDoor(SessionWorker):
                 break
         raise PlanningError("the joints still move: wait until they are at rest", PlanCode.START_STATE_INVALID)
 
-    def _margins(self) -> Margins:
+    def _world(self) -> World:
+        """The present world, with the floor."""
+        floor = self._margins().floor
+        return with_floor(world_of(self.session.bus), self._robot.description.floor if floor is None else floor)
+
+    def _margins(self) -> GoalCheckOptions:
         """Distances of the mode's planner, or of the section."""
         planner = self.session.config.control_modes[self.session.mode].planner
         if planner is not None and isinstance(planner.options, RrtConnectOptions):

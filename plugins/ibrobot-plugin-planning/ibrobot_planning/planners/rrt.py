@@ -31,13 +31,12 @@ from ibrobot_planning.planner import (
 from ibrobot_planning.planners.constrained import ConstrainedChecks, ConstrainedSpace
 from ibrobot_planning.planners.linear import linear_path
 from ibrobot_planning.planners.options import RrtConnectOptions
-from ibrobot_planning.planners.paths import CHECK_S, collisions, outwards, sentence, with_floor
 from ibrobot_planning.planners.search import Pace, Space, connect, shortened
-from ibrobot_planning.planners.timing import Motion, resting, timed, trajectory_of
+from ibrobot_planning.planners.timing import CHECK_S, Motion, resting, timed, trajectory_of
 from ibrobot_planning.world.arm import Arm
 from ibrobot_planning.world.checked_arm import checked_arm
-from ibrobot_planning.world.collision import Collisions
-from ibrobot_planning.world.objects import World, world_of
+from ibrobot_planning.world.collision import Collisions, outwards, sentence
+from ibrobot_planning.world.objects import World, with_floor, world_of
 
 _RESOLUTIONS_M = (0.05, 0.02, 0.005)
 """Maximum motion of the arm between checks of the search; finer ones follow if the timed motion touches."""
@@ -87,7 +86,8 @@ class RrtConnectPlanner(Planner):
         begun = time.monotonic()
         start = self._check_start(request)
         world = with_floor(world_of(self._ctx.bus, lambda: self.world), self._floor)
-        checks = collisions(self.arm, world, request.joints, request.others, self._options)
+        margins = {"padding": self._options.padding, "self_padding": self._options.self_padding}
+        checks = Collisions(self.arm, world, request.joints, request.others, **margins)
         checks.before = request.check_wanted  # whatever takes time in a search checks for contacts
         deadline = begun + self._options.planning_time
         assert self._tool is not None

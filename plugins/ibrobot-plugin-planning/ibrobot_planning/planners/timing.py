@@ -25,6 +25,8 @@ _BLEND_POINTS = 8
 """Grid intervals in a blend."""
 _SAMPLE_S = 0.001
 """Time between samples of the motion before it is averaged."""
+CHECK_S = 0.001
+"""Time between checks of a timed motion for contacts [s]."""
 LONGEST_S = 300.0
 """Longest motion: motions are computed, checked and sent in samples."""
 _STILL = 1e-9

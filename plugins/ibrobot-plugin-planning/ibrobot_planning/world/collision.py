@@ -6,7 +6,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, Protocol
 
 import attrs
 import numpy as np
@@ -27,6 +27,9 @@ WIDER_M = (0.0, 0.004, 0.02)
 without a check."""
 _ALWAYS_SHARE = 0.95
 """Links that touch in at least this share of configurations always touch, as in MoveIt's setup assistant."""
+
+_WORSE_M = 1e-4
+"""Allowed decrease of a distance while the arm leaves a contact [m]."""
 
 type Flags = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 
@@ -370,3 +373,34 @@ def checked_pairs(
     joints = np.array([shape.joint for shape in shapes])
     checked = apart[np.ix_(of, of)] & (joints[:, None] != joints[None])
     return checked, np.where(standing[of][:, None] | standing[of][None], padding, self_padding)
+
+
+class ContactChecks(Protocol):
+    """The part of a collision checker that looks at single configurations."""
+
+    def free(self, q: Vector) -> bool:
+        """Whether `q`, shape (J,), is free."""
+
+    def contacts(self, q: Vector) -> list[Contact]:
+        """Contacts closer than their padding at `q`, shape (J,)."""
+
+
+def outwards(checks: ContactChecks, configurations: Vector) -> int | None:
+    """Number of configurations before the first free one, while distances grow; None if one shrinks."""
+    before = {(each.first, each.second): each.distance for each in checks.contacts(configurations[0])}
+    for number, q in enumerate(configurations):
+        if checks.free(q):
+            return number
+        now = {(each.first, each.second): each.distance for each in checks.contacts(q)}
+        if any(pair not in before or distance < before[pair] - _WORSE_M for pair, distance in now.items()):
+            return None
+        before = {pair: max(distance, before[pair]) for pair, distance in now.items()}
+    return None
+
+
+def sentence(contacts: Sequence[Contact], most: int = 3) -> str:
+    """The deepest contacts in words."""
+    if not contacts:
+        return "something touches"
+    further = f", and {len(contacts) - most} more" if len(contacts) > most else ""
+    return "; ".join(str(contact) for contact in contacts[:most]) + further

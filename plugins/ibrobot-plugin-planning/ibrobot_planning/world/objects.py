@@ -15,7 +15,7 @@ import numpy as np
 from ibrobot_kinematics.visible_names import name_fault
 from numpy.typing import ArrayLike
 
-from ibrobot_core.api import PlanCode, PlanningError, Pose, Vector
+from ibrobot_core.api import PlanCode, PlanningError, Pose, Vector, Vector3
 from ibrobot_core.app import Bus, NoRequest, Service
 from ibrobot_planning.world.ages import AgeSummary
 from ibrobot_planning.world.bounds import FURTHEST
@@ -371,6 +371,17 @@ def world_of(bus: Bus | None, otherwise: Callable[[], World] = World) -> World:
         PlanningError: if a part of the world is too old, and its rule is to refuse plans.
     """
     return bus.call(SNAPSHOT) if bus is not None and bus.serves(SNAPSHOT) else otherwise()
+
+
+def with_floor(world: World, floor: float | None) -> World:
+    """The world with a floor at a height [m], unless it has one; None: no floor."""
+    named = world.objects.get(FLOOR)
+    if floor is None or (named is not None and isinstance(named.shape, Plane)):
+        return world
+    # Another object of this name does not take the table's place.
+    return world.add(
+        FLOOR if named is None else f"{FLOOR} of the planner", WorldObject(Plane(), Pose(Vector3(0.0, 0.0, floor)))
+    )
 
 
 def observed_world(bus: Bus) -> ObservedWorld:
