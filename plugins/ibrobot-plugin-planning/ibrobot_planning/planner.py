@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Literal
 
 import attrs
+import numpy as np
 
 from ibrobot_core.api import Descriptor, PlanCode, PlanningError
 
 if TYPE_CHECKING:
     from ibrobot_kinematics import PathConstraints
 
-    from ibrobot_core.api import JointTrajectory, Pose, Vector, Vector3
+    from ibrobot_core.api import JointTrajectory, Pose, Robot, Vector, Vector3
 
 OrientationPolicy = Literal["refuse", "nearest", "keep_axis", "arm_plane", "current", "free"]
 LEAST_SCALING = 0.01
@@ -133,6 +134,60 @@ class PlanRequest:
     """Positions [rad] of joints that do not move, e.g. the gripper; omitted joints are assumed to be at 0."""
     check_wanted: Callable[[], None] = lambda: None
     """Raises a PlanningError once nobody wants the plan any more. Planners that search call it often."""
+
+
+def checked_start(request: PlanRequest, robot: Robot) -> Vector:
+    """Check the joints, the start and the scalings of a request. Returns the start [rad], shape (J,).
+
+    Raises:
+        PlanningError: for unknown joints, a start of another shape or that is not finite, and invalid scalings.
+    """
+    for name in (*request.joints, *request.others):
+        if name not in robot.joint_names:
+            raise PlanningError(
+                f"no joint {name!r}; the joints are: {', '.join(robot.joint_names)}", PlanCode.INVALID_GROUP_NAME
+            )
+    start = np.array(request.start, dtype=float)
+    if start.shape != (len(request.joints),):
+        raise PlanningError(
+            f"start has shape {start.shape}, must be ({len(request.joints)},): one per joint",
+            PlanCode.INVALID_ROBOT_STATE,
+        )
+    for name, scaling in (("velocity", request.velocity_scaling), ("acceleration", request.acceleration_scaling)):
+        if fault := scaling_fault(f"{name}_scaling", scaling):
+            raise PlanningError(fault)
+    for name, value in zip(request.joints, start.tolist(), strict=True):
+        if not np.isfinite(value):
+            raise PlanningError(f"start of joint {name} is {value}, must be finite", PlanCode.INVALID_ROBOT_STATE)
+    return start
+
+
+def joint_target(goal: JointGoal, robot: Robot, joints: Sequence[str], start: Vector) -> Vector:
+    """Goal positions of the planned `joints` [rad], shape (len(joints),).
+
+    Raises:
+        PlanningError: for unknown joints, wrong shapes, and positions outside the limits.
+    """
+    positions = np.asarray(goal.positions, dtype=float)
+    if positions.shape != (len(goal.joints),):
+        raise invalid_goal(f"goal has positions of shape {positions.shape}, must be ({len(goal.joints)},)")
+    if not 0 <= goal.tolerance < np.inf:
+        raise invalid_goal(f"goal has a tolerance of {goal.tolerance} rad, must be at least 0")
+    target = np.array(start, dtype=float)
+    limits = {joint.name: (joint.lower, joint.upper) for joint in robot.joints}
+    for i, (name, value) in enumerate(zip(goal.joints, positions.tolist(), strict=True)):
+        if name not in limits:
+            raise invalid_goal(f"no joint {name!r}; the joints are: {', '.join(limits)}")
+        if name not in joints:
+            raise invalid_goal(f"goal names joint {name!r}, which is not planned: {', '.join(joints)}")
+        if name in goal.joints[:i]:
+            raise invalid_goal(f"goal names joint {name!r} twice")
+        lower, upper = limits[name]
+        # Written so that NaN fails it.
+        if not lower <= value <= upper:
+            raise invalid_goal(f"goal of joint {name} is {value} rad, must be within {lower} .. {upper} rad")
+        target[joints.index(name)] = value
+    return target
 
 
 @attrs.frozen(eq=False)

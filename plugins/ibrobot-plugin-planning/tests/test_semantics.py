@@ -10,8 +10,7 @@ import pytest
 from ibrobot_kinematics.srdf import GroupState, read_srdf
 from ibrobot_kinematics.urdf import read_urdf
 from ibrobot_planning.commands.description import srdf_of as srdf
-from ibrobot_planning.goals.grammar import target
-from ibrobot_planning.goals.joints import named_pose, pose_names
+from ibrobot_planning.goals.grammar import named_pose, pose_names, target
 from ibrobot_planning.planner import NamedGoal, PlanRequest
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.rrt import RrtConnectPlanner

@@ -24,8 +24,7 @@ from ibrobot_core.api import (
 )
 from ibrobot_core.app import ControlMode, RobotConfig, RunView
 from ibrobot_planning.execution.motions import commanded
-from ibrobot_planning.goals.grammar import GoalOptions, Target
-from ibrobot_planning.goals.joints import without_names
+from ibrobot_planning.goals.grammar import GoalOptions, Target, without_names
 from ibrobot_planning.goals.tool import Tool
 from ibrobot_planning.planner import (
     AnyGoal,

@@ -12,10 +12,13 @@ from typing import Any, Literal, get_args
 import attrs
 import numpy as np
 from ibrobot_kinematics import PathConstraints
+from ibrobot_kinematics.errors import KinematicsError
 from ibrobot_kinematics.path_constraints import AXES, CONSTRAINT_KEYS
 from ibrobot_kinematics.poses import homogeneous, matrix, pose
 from ibrobot_kinematics.rotations import from_quaternion, from_rpy
 from ibrobot_kinematics.run_frames import BASE_FRAMES
+from ibrobot_kinematics.srdf import GroupState, read_srdf
+from ibrobot_kinematics.urdf import read_urdf
 
 from ibrobot_core.api import (
     JointTrajectory,
@@ -28,7 +31,6 @@ from ibrobot_core.api import (
     documented,
     option,
 )
-from ibrobot_planning.goals.joints import named_pose
 from ibrobot_planning.planner import (
     AnyGoal,
     ConstrainedGoal,
@@ -263,6 +265,63 @@ def check_frame(frame: str) -> None:
     if frame not in BASE_FRAMES:
         names = ", ".join(filter(None, BASE_FRAMES))
         raise PlanningError(f"frame {frame!r} is not the base; it is called {names}", PlanCode.FRAME_TRANSFORM_FAILURE)
+
+
+def pose_names(robot: Robot) -> list[str]:
+    """The names of a robot's poses.
+
+    Raises:
+        PlanningError: if its URDF or SRDF cannot be read.
+    """
+    return list(dict.fromkeys([*robot.description.poses, *(state.name for state in _group_states(robot))]))
+
+
+def named_pose(robot: Robot, name: str) -> dict[str, float]:
+    """Joint -> position [rad], from the robot YAML, or else from all group states of this name in the SRDF.
+
+    Raises:
+        PlanningError: for an unknown name, group states that contradict each other, or files that cannot be read.
+    """
+    if name in robot.description.poses:
+        return dict(zip(robot.joint_names, robot.pose(name).tolist(), strict=True))
+    states = [state for state in _group_states(robot) if state.name == name]
+    if not states:
+        raise invalid_goal(f"no pose {name!r}; the poses are: {', '.join(pose_names(robot)) or 'none'}")
+    positions: dict[str, float] = {}
+    for state in states:
+        for joint, value in state.positions.items():
+            if joint not in robot.joint_names:
+                continue
+            if positions.setdefault(joint, value) != value:
+                groups = ", ".join(each.group for each in states)
+                raise invalid_goal(f"pose {name!r} of the SRDF has two positions of joint {joint}, in groups {groups}")
+    return positions
+
+
+def _group_states(robot: Robot) -> tuple[GroupState, ...]:
+    description = robot.description
+    if description.srdf is None or description.urdf is None:
+        return ()
+    try:
+        return read_srdf(description.srdf, read_urdf(description.urdf)).states
+    except KinematicsError as error:
+        raise invalid_goal(str(error)) from None
+
+
+def without_names(goal: Goal, robot: Robot, joints: Sequence[str]) -> Goal:
+    """The goal, with named poses replaced by the positions of `joints`.
+
+    Raises:
+        PlanningError: as `named_pose`.
+    """
+    if isinstance(goal, AnyGoal):
+        return AnyGoal(tuple(without_names(each, robot, joints) for each in goal.goals))  # type: ignore[misc]
+    if isinstance(goal, ConstrainedGoal):
+        return ConstrainedGoal(without_names(goal.goal, robot, joints), goal.constraints)  # type: ignore[arg-type]
+    if not isinstance(goal, NamedGoal):
+        return goal
+    positions = {joint: value for joint, value in named_pose(robot, goal.name).items() if joint in joints}
+    return JointGoal(tuple(positions), np.array(list(positions.values())))
 
 
 @attrs.frozen

@@ -19,8 +19,8 @@ from ibrobot_core.api import (
     ns,
     seconds,
 )
-from ibrobot_planning.goals.joints import checked_start, joint_target
-from ibrobot_planning.planner import JointGoal, NamedGoal, Planner, PlanRequest, PlanResult
+from ibrobot_planning.goals.grammar import without_names
+from ibrobot_planning.planner import JointGoal, Planner, PlanRequest, PlanResult, checked_start, joint_target
 from ibrobot_planning.planners.options import JointPlannerOptions
 from ibrobot_planning.planners.timing import check_duration
 
@@ -47,13 +47,14 @@ class JointPlanner(Planner):
     def plan(self, request: PlanRequest) -> PlanResult:
         # A start outside the limits is allowed: an arm at rest may sag beyond them, and must be able to return.
         start, order = checked_start(request, self._robot), self._robot.indices(request.joints)
-        if not isinstance(request.goal, JointGoal | NamedGoal):
+        goal = without_names(request.goal, self._robot, request.joints)
+        if not isinstance(goal, JointGoal):
             raise PlanningError(
                 "planner type 'joint' knows joint goals only, not poses of the tool, nor path constraints: "
                 "name a pose of robot.description.poses, or use another type of planner, one for Cartesian goals",
                 PlanCode.UNRECOGNIZED_GOAL_TYPE,
             )
-        delta = joint_target(request.goal, self._robot, request.joints, start) - start
+        delta = joint_target(goal, self._robot, request.joints, start) - start
         velocity = self._options.velocity_scaling * request.velocity_scaling * self._robot.max_velocity[order]
         acceleration = (
             self._options.acceleration_scaling * request.acceleration_scaling * self._robot.max_acceleration[order]

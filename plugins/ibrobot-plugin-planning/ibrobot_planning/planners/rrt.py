@@ -12,7 +12,7 @@ import numpy as np
 from ibrobot_kinematics import ToolConstraints, robot_model
 
 from ibrobot_core.api import Context, PlanCode, PlanningError, Vector
-from ibrobot_planning.goals.joints import checked_start, joint_target
+from ibrobot_planning.goals.grammar import without_names
 from ibrobot_planning.goals.tool import Candidate, Tool
 from ibrobot_planning.planner import (
     AnyGoal,
@@ -20,13 +20,14 @@ from ibrobot_planning.planner import (
     Goal,
     JointGoal,
     LinearGoal,
-    NamedGoal,
     Planner,
     PlanRequest,
     PlanResult,
     PoseGoal,
     PositionGoal,
+    checked_start,
     invalid_goal,
+    joint_target,
 )
 from ibrobot_planning.planners.constrained import ConstrainedChecks, ConstrainedSpace
 from ibrobot_planning.planners.linear import linear_path
@@ -238,7 +239,8 @@ class _Plan:
 
     def _candidates(self, goal: Goal) -> list[Candidate]:
         robot = self.ctx.robot
-        if isinstance(goal, JointGoal | NamedGoal):
+        goal = without_names(goal, robot, self.request.joints)
+        if isinstance(goal, JointGoal):
             whole = self._whole()
             whole[self._order] = joint_target(goal, robot, self.request.joints, self.start)
             return [Candidate(whole)]

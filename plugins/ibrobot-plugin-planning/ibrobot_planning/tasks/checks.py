@@ -12,8 +12,7 @@ import numpy as np
 from ibrobot_core.api import IbrobotError, PlanningError, Vector
 from ibrobot_core.app import ControlMode, RobotConfig, check_models, installed_plugins
 from ibrobot_planning.execution.plans import tool_planners
-from ibrobot_planning.goals.grammar import GoalOptions
-from ibrobot_planning.goals.joints import named_pose, pose_names
+from ibrobot_planning.goals.grammar import GoalOptions, named_pose, pose_names
 from ibrobot_planning.planner import AnyGoal, ConstrainedGoal, Goal, LinearGoal, PoseGoal, PositionGoal
 from ibrobot_planning.tasks.format import (
     Alternatives,

@@ -8,8 +8,7 @@ from typing import Any, Literal, override
 import attrs
 
 from ibrobot_core.api import Robot, Vector, documented, option
-from ibrobot_planning.goals.grammar import GoalOptions, Target, check_waypoints, exactly_one, line_goal
-from ibrobot_planning.goals.joints import named_pose
+from ibrobot_planning.goals.grammar import GoalOptions, Target, check_waypoints, exactly_one, line_goal, named_pose
 from ibrobot_planning.planner import LEAST_SCALING, AnyGoal, Goal
 from ibrobot_planning.world.objects import World
 
