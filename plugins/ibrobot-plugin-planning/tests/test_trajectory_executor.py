@@ -528,6 +528,14 @@ def test_a_bad_goal_is_rejected_precisely_and_the_old_one_goes_on(message: str) 
     ]
 
 
+def test_last_velocity_of_a_rounding_error_counts_as_rest() -> None:
+    arm = Arm()
+    arm.go(goal(point(1.0, (0.5, 0.0), (1e-7, 0.0))))
+    assert arm.at(1.0) == [0.5, 0.0]
+    assert arm.at(1.01) == [0.5, 0.0]
+    assert [status.state for status in arm.statuses()] == [GoalState.EXECUTING, GoalState.SUCCEEDED]
+
+
 def test_fields_given_as_empty_lists_are_not_given() -> None:
     arm = Arm()
     arm.go(goal(point(1.0, (1.0, 0.0), (), ())))
