@@ -11,7 +11,7 @@ from command_line import run_here
 from ibrobot_calibration import JointCalibration
 from ibrobot_calibration.joint_units import calibrations, radians_to_lerobot
 from ibrobot_data.config_metadata import load_contract
-from ibrobot_feetech.ticks import ticks_to_radians
+from ibrobot_feetech.ticks import TICKS_PER_RADIAN
 from lerobot_units import normalised
 
 from ibrobot_core.app import load_config
@@ -57,7 +57,8 @@ def test_calibration_of_lerobot_gives_the_same_angles_from_the_same_ticks(tmp_pa
         assert joint.numbers() == numbers[name]
         mode = "range_0_100" if name == "gripper" else "degrees"
         ticks = np.linspace(joint.range_min, joint.range_max, 50).round()
-        angles = ticks_to_radians(ticks, zero=joint.zero(joint.closed_at), inverted=joint.inverted)
+        sign = -1.0 if joint.inverted else 1.0
+        angles = (ticks - joint.zero(joint.closed_at)) * sign / TICKS_PER_RADIAN
         ours = radians_to_lerobot(angles, mode, *joint.ends(joint.closed_at), joint.inverted)
         np.testing.assert_allclose(ours, [normalised(each, mode, joint) for each in ticks], atol=1e-9)
         if name != "gripper":

@@ -17,7 +17,7 @@ from ibrobot_feetech.calibration import ZERO_AT
 from ibrobot_feetech.errors import FeetechError, NoReply, TorqueStaysOn
 from ibrobot_feetech.registers import MODEL_STS3215
 from ibrobot_feetech.supply import check_supply
-from ibrobot_feetech.ticks import radians_to_ticks, ticks_to_radians
+from ibrobot_feetech.ticks import TICKS_PER_RADIAN
 
 _LAST_TICK = 4095
 _ANGLE_BEYOND_A_TURN = 0x10
@@ -58,10 +58,6 @@ class Arm:
         return np.array([self._of(joint).zero(self.closed.get(joint)) for joint in self.joints])
 
     @cached_property
-    def _inverted(self) -> NDArray[np.bool_]:
-        return np.array([self._of(joint).inverted for joint in self.joints])
-
-    @cached_property
     def _limits(self) -> tuple[Vector, Vector]:
         each = [self._of(joint) for joint in self.joints]
         return np.array([float(c.range_min) for c in each]), np.array([float(c.range_max) for c in each])
@@ -69,12 +65,12 @@ class Arm:
     @cached_property
     def sign(self) -> Vector:
         """1, or -1 where radians decrease as ticks increase; shape (J,)."""
-        signs: Vector = np.where(self._inverted, -1.0, 1.0)
-        return signs
+        return np.array([-1.0 if self._of(joint).inverted else 1.0 for joint in self.joints])
 
     def radians(self, ticks: Vector) -> Vector:
         """Reported positions [ticks] -> joint positions [rad], shape (J,)."""
-        return ticks_to_radians(ticks, zero=self._zero, inverted=self._inverted)
+        radians: Vector = (ticks - self._zero) * self.sign / TICKS_PER_RADIAN
+        return radians
 
     def ticks(self, radians: Vector) -> NDArray[np.intp]:
         """Joint positions [rad] -> goals [ticks], shape (J,), within the calibrated ranges."""
@@ -82,7 +78,7 @@ class Arm:
 
     def positions(self, radians: Vector) -> NDArray[np.intp]:
         """Joint positions [rad] -> reported positions [ticks], shape (J,), not limited to the calibrated ranges."""
-        return np.rint(radians_to_ticks(radians, zero=self._zero, inverted=self._inverted)).astype(np.intp)
+        return np.rint(radians * self.sign * TICKS_PER_RADIAN + self._zero).astype(np.intp)
 
     def reach(self) -> tuple[Vector, Vector]:
         """Lower and upper ends of the calibrated ranges [rad], each shape (J,)."""

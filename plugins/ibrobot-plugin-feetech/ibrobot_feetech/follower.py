@@ -39,9 +39,9 @@ from ibrobot_feetech.port import emulate, is_device
 from ibrobot_feetech.protocol import OVER_CURRENT, OVERLOAD, faults
 from ibrobot_feetech.supply import supply
 from ibrobot_feetech.sync import Replies, SyncReader, SyncWriter
+from ibrobot_feetech.ticks import TICKS_PER_RADIAN
 from ibrobot_feetech.usb import check_adapter
 
-_RADIANS_PER_TICK = 2 * np.pi / 4096
 _SLACK_TICKS = 16
 """Allowed distance of a position from the one predicted by the last position and speed [ticks]."""
 _MAX_ACCELERATION, _MAX_SPEED = 40_000, 4_000
@@ -309,7 +309,7 @@ class FeetechFollower(Hardware):
         self._ticks = np.where(good, position, self._ticks)
         self._ticks_ns = np.where(good, stamp_ns, self._ticks_ns)
         self._speed = np.where(good, velocity, self._speed)
-        self._velocity = self._speed * self._arm.sign * _RADIANS_PER_TICK
+        self._velocity = self._speed * self._arm.sign / TICKS_PER_RADIAN
         self._values[3] = np.where(good, load * self._arm.sign * _LOAD, self._values[3])
         self._load.add(self._values[3], good)
 

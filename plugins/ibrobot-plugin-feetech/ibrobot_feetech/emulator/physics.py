@@ -13,7 +13,7 @@ from ibrobot_core.app import Registry, RobotConfig
 from ibrobot_feetech.arm import Arm
 from ibrobot_feetech.emulator.pty import Emulator
 from ibrobot_feetech.emulator.signals import SignalServer
-from ibrobot_feetech.ticks import radians_to_ticks
+from ibrobot_feetech.ticks import TICKS_PER_RADIAN
 
 
 class PhysicsArm:
@@ -105,7 +105,7 @@ class PhysicsArm:
         reading = self._hardware.read()
         arm = self._arm
         ticks = arm.positions(reading.position)
-        speeds = np.rint(radians_to_ticks(reading.velocity * arm.sign, zero=0.0))
+        speeds = np.rint(reading.velocity * arm.sign * TICKS_PER_RADIAN)
         with self._emulator.lock:
             for servo, tick, speed in zip(arm.servos, ticks, speeds, strict=True):
                 emulated = self._emulator.servos[servo]
