@@ -146,3 +146,14 @@ def decode(message: Mapping[str, Any]) -> Command:
     except ValueError as error:
         raise HardwareError(f"malformed command {do}: {error}") from None
     return command
+
+
+def raise_error(reply: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a reply, or raise if its command failed.
+
+    Raises:
+        HardwareError: with the message of the control loop.
+    """
+    if "error" in reply:
+        raise HardwareError(str(reply["error"]))
+    return reply

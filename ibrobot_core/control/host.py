@@ -19,7 +19,7 @@ from ibrobot_core.component import raise_thread_priority
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.control import commands
 from ibrobot_core.control.core import ControlCore
-from ibrobot_core.control.link import LinkLayout, SharedMemory, raise_error
+from ibrobot_core.control.link import LinkLayout, SharedMemory
 from ibrobot_core.control.timing import REPORT_TICKS, TOO_BUSY, Punctuality
 from ibrobot_core.errors import ComponentFailed, HardwareError, IbrobotError
 from ibrobot_core.interfaces.run_state import ControlState, PlanRecord
@@ -176,7 +176,7 @@ class InlineControl(ControlHost):
     def call(self, command: commands.Command) -> Mapping[str, Any]:
         reply = self._core.handle(command)
         self.stops = reply["stops"]
-        return raise_error(reply)
+        return commands.raise_error(reply)
 
     @override
     def write_plan(self, plan: PlanRecord) -> None:
@@ -323,7 +323,7 @@ class ControlClient(ControlHost):
             reply = answer.get(timeout=_REPLY_TIMEOUT_S)
             if "gone" in reply:
                 raise ComponentFailed(reply["gone"])
-            return raise_error(reply)
+            return commands.raise_error(reply)
         except queue.Empty:
             name = type(command).__name__
             raise ComponentFailed(f"control did not answer {name} within {_REPLY_TIMEOUT_S:.0f} s") from None

@@ -12,14 +12,12 @@ from __future__ import annotations
 
 import mmap
 import os
-from collections.abc import Mapping
 from typing import Any
 from zlib import crc32
 
 import attrs
 import numpy as np
 
-from ibrobot_core.errors import HardwareError
 from ibrobot_core.interfaces.run_state import ControlState, PlanRecord
 
 STATE_SLOTS = 256
@@ -206,14 +204,3 @@ def _state(record: Any) -> ControlState:
         success=None if success < 0 else bool(success), position=record["position"], velocity=record["velocity"],
         effort=record["effort"], command=record["command"], signals=record["signals"],
     )  # fmt: skip
-
-
-def raise_error(reply: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a reply, or raise if its command failed.
-
-    Raises:
-        HardwareError: with the message of the control loop.
-    """
-    if "error" in reply:
-        raise HardwareError(str(reply["error"]))
-    return reply

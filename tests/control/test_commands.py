@@ -12,7 +12,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from ibrobot_core.control.commands import Command, decode, encode
+from ibrobot_core.control.commands import Command, decode, encode, raise_error
 from ibrobot_core.errors import HardwareError
 from ibrobot_core.interfaces.executor import ExecutorGoal, FollowTrajectory, MoveJoint, SlowDown
 from ibrobot_core.messages import Header, JointTrajectory, JointTrajectoryPoint
@@ -153,3 +153,9 @@ def test_a_name_that_no_command_has_is_refused_with_the_names(do: Any) -> None:
     assume(do not in [kind.__name__ for kind in KINDS])
     with pytest.raises(HardwareError, match=r"^control has no command .*; the commands are: SwitchMode, "):
         decode({"do": do})
+
+
+def test_an_answer_with_an_error_raises_it() -> None:
+    assert raise_error({"reply": 1, "generation": 2}) == {"reply": 1, "generation": 2}
+    with pytest.raises(HardwareError, match="no servo 3"):
+        raise_error({"reply": 1, "error": "no servo 3"})

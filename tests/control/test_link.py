@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from ibrobot_core.control import link
-from ibrobot_core.control.link import PLAN_ROWS, STATE_SLOTS, LinkLayout, SharedMemory, raise_error
-from ibrobot_core.errors import HardwareError
+from ibrobot_core.control.link import PLAN_ROWS, STATE_SLOTS, LinkLayout, SharedMemory
 from ibrobot_core.interfaces.run_state import ControlState, PlanRecord
 from ibrobot_core.memory import create_memory
 
@@ -225,9 +224,3 @@ class TestPlans:
         received = control.read_plan()
         assert received is not None
         assert received.generation == 1
-
-
-def test_an_answer_with_an_error_raises_it() -> None:
-    assert raise_error({"reply": 1, "generation": 2}) == {"reply": 1, "generation": 2}
-    with pytest.raises(HardwareError, match="no servo 3"):
-        raise_error({"reply": 1, "error": "no servo 3"})
