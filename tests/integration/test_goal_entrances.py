@@ -90,7 +90,7 @@ REFUSED: dict[str, tuple[Goal, TrajectoryCode, str]] = {
     "acceleration of 1e308": (
         goal(point(2, beside(0.1), velocities=REST, accelerations=[1e308, 0, 0, 0, 0])),
         INVALID,
-        "accelerations that are not finite, or beyond 1e+06",
+        "among its accelerations; each must be a finite number, up to 1e+06",
     ),
     "path tolerance NaN": (
         goal(point(2, beside(0.1)), path_tolerance=[tolerance("elbow_flex", NOT_A_NUMBER)]),

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ibrobot_planning.execution.door import GoalDoor
 from ibrobot_planning.execution.motions import Execution
 from ibrobot_planning.execution.plans import GoalPlans
 from ibrobot_ros2.services import Answer, Call, decode_answer, decode_call, encode_answer, encode_call
@@ -108,21 +109,28 @@ def test_no_request_ends_the_run_shows_its_inside_or_moves_unchecked(
 
 
 def note_motions(monkeypatch: pytest.MonkeyPatch) -> tuple[list[Any], list[Any]]:
-    """Trajectories that were completed and checked, and those that began."""
+    """Trajectories that were completed, and then checked, and those that began."""
+    completed: list[Any] = []
     checked: list[Any] = []
     begun: list[Any] = []
-    check, send = GoalPlans._checked, Execution._send
+    complete, check, send = GoalPlans._completed, GoalDoor.check_free, Execution._send
 
-    def note_checked(self: GoalPlans, *arguments: Any) -> Any:
-        checked.append(check(self, *arguments))
-        return checked[-1]
+    def note_completed(self: GoalPlans, *arguments: Any) -> Any:
+        completed.append(complete(self, *arguments))
+        return completed[-1]
+
+    def note_checked(self: GoalDoor, trajectory: Any) -> None:
+        check(self, trajectory)
+        if any(trajectory is known for known in completed):
+            checked.append(trajectory)
 
     def note_begun(self: Execution, name: str, goal_id: str, goal: Any) -> None:
+        send(self, name, goal_id, goal)
         if isinstance(goal, FollowTrajectory) and goal.takes_over is None:  # others are parts of the running one
             begun.append(goal.trajectory)
-        send(self, name, goal_id, goal)
 
-    monkeypatch.setattr(GoalPlans, "_checked", note_checked)
+    monkeypatch.setattr(GoalPlans, "_completed", note_completed)
+    monkeypatch.setattr(GoalDoor, "check_free", note_checked)
     monkeypatch.setattr(Execution, "_send", note_begun)
     return checked, begun
 
