@@ -228,8 +228,8 @@ def _field(rows: Sequence[Vector], name: str, order: Sequence[int]) -> Vector | 
     wrong = ~(np.abs(values) <= _LARGEST)  # so that NaN is wrong
     if wrong.any():
         index, joint = np.argwhere(wrong)[0]
-        found = f"point {index} has {values[index, joint]:g} among its {name}"
-        raise GoalRejected(f"{found}; each must be a finite number, up to {_LARGEST:g}")
+        fault = f"point {index} has {values[index, joint]:g} among its {name}"
+        raise GoalRejected(f"{fault}; each must be a finite number, up to {_LARGEST:g}")
     return values[:, order]
 
 
