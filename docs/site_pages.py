@@ -13,10 +13,11 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from docutils import nodes
-from sphinx import addnodes
+from furo.navigation import get_navigation_tree
 from sphinx.application import Sphinx
+from sphinx.builders.html import StandaloneHTMLBuilder
 from sphinx.environment import BuildEnvironment
+from sphinx.environment.adapters.toctree import global_toctree_for_doc
 
 Page = Callable[[], Iterator[str]]
 _SOURCE = re.compile(r'^\[`([\w./-]+)`\]\(((?:\.\./)+\S+?\.(?:py|toml))(?: "(.*)")?\)$', re.MULTILINE)
@@ -27,6 +28,8 @@ _TESTED = re.compile(r"^<!-- doctest -->\n```pycon$", re.MULTILINE)
 _LINK = re.compile(r"\]\(([\w-]+(?:/index|\.zh)?)\.md\)")
 SPLIT = ("reference/interfaces", "reference/testing")
 """Pages whose sections on one source file each are pages of their own on the site."""
+_ENTRY = re.compile(r'^<li class="([^"]*)"><a class="reference internal" href="([^"]*)"(.*)$', re.MULTILINE)
+_UNFOLDED = '<ul class="current">'
 _TERM = re.compile(r"^- \*\*(.+)\*\*: ", re.MULTILINE)
 
 
@@ -52,45 +55,54 @@ def connect(app: Sphinx, generated: Mapping[str, Page], *, are_read: bool = Fals
     app.connect("env-get-outdated", outdated)
 
 
-def copy_titles_alone(app: Sphinx) -> None:
-    """Give the navigation of each page the titles of all pages, not their headings.
+def make_navigation_once(app: Sphinx) -> None:
+    """Give each page the navigation that Furo makes of all titles, with its own links and marks, made once for all.
 
-    Furo asks for titles. Sphinx copies all headings of all pages before it drops them, for each page again: that took
-    half of the time of a build. The navigation stays the same.
+    Sphinx and Furo make it anew for each page, of all pages: that took more than half of the time of a build. Pages stay
+    the same.
     """
-    titles: dict[str, nodes.bullet_list] = {}
+    made: list[str] = []
 
-    def titles_of(env: BuildEnvironment) -> dict[str, nodes.bullet_list]:
-        for name, contents in env.tocs.items() if not titles else ():
-            titles[name] = contents.deepcopy()
-            for item in titles[name].children:
-                if isinstance(item, nodes.list_item) and len(item) > 1:
-                    _drop_headings(item)
-        return titles
+    def leave_out(app: Sphinx, name: str, template: str, context: dict[str, Any], doctree: object) -> None:
+        del context["toctree"]
 
-    def page(app: Sphinx, name: str, template: str, context: dict[str, Any], doctree: nodes.document | None) -> None:
-        whole, toctree = app.env.tocs, context["toctree"]
+    def page(app: Sphinx, name: str, template: str, context: dict[str, Any], doctree: object) -> None:
+        if not made:
+            made.append(_navigation(app))
+        context["furo_navigation_tree"] = _navigation_on(app, name, made[0])
 
-        def navigation(**options: Any) -> str:
-            app.env.tocs = titles_of(app.env) if options.get("titles_only") else whole
-            try:
-                return str(toctree(**options))
-            finally:
-                app.env.tocs = whole
-
-        context["toctree"] = navigation
-
-    app.connect("html-page-context", page, priority=400)  # before Furo
+    app.connect("html-page-context", leave_out, priority=400)  # before Furo
+    app.connect("html-page-context", page, priority=600)
 
 
-def _drop_headings(item: nodes.list_item) -> None:
-    """Keep the title of a page and what it lists."""
-    if listed := list(item.findall(addnodes.toctree)):
-        below = item[1]
-        assert isinstance(below, nodes.Element)
-        below[:] = listed
-    else:
-        item.pop(1)
+def _navigation(app: Sphinx) -> str:
+    """The navigation as the first page of the site has it: a line for each page."""
+    assert isinstance(app.builder, StandaloneHTMLBuilder)
+    tree = global_toctree_for_doc(app.env, app.config.root_doc, app.builder, tags=app.tags, maxdepth=-1, titles_only=True)
+    return get_navigation_tree(app.builder.render_partial(tree)["fragment"])
+
+
+def _navigation_on(app: Sphinx, name: str, navigation: str) -> str:
+    """The navigation with links from a page, which is marked and unfolded with all above it."""
+    parents = {below: above for above, names in app.env.toctree_includes.items() for below in names}
+    marked, page = {}, name
+    while page in parents:
+        marked[app.builder.get_target_uri(page)] = page
+        page = parents[page]
+
+    def line(match: re.Match[str]) -> str:
+        level, target, rest = match.groups()
+        link = app.builder.get_relative_uri(name, target.removesuffix(".html"))
+        if target not in marked:
+            return f'<li class="{level}"><a class="reference internal" href="{link}"{rest}'
+        level = level.replace(" ", " current ", 1) if " " in level else f"{level} current"
+        rest = rest.replace(' class="toctree-checkbox"', ' checked="" class="toctree-checkbox"')
+        if marked[target] == name:
+            return f'<li class="{level} current-page"><a class="current reference internal" href="#"{rest}'
+        return f'<li class="{level}"><a class="reference internal" href="{link}"{rest.replace("<ul>", _UNFOLDED)}'
+
+    whole = _ENTRY.sub(line, navigation)
+    return whole.replace("<ul>", _UNFOLDED, 1) if marked else whole
 
 
 def site_markdown(name: str, text: str) -> str:
