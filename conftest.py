@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 
@@ -14,6 +15,15 @@ for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIG
 
 os.environ["IBROBOT_INSTALLER"] = "pip install"  # in remedies, whatever installed what runs here
 os.environ.pop("UV_RUN_RECURSION_DEPTH", None)  # with it, the commands in messages begin with `uv run`
+
+gc.disable()  # what collecting tests makes stays: no garbage is looked for in it, now or later
+
+
+def pytest_collection_finish() -> None:
+    """Called by pytest."""
+    gc.freeze()
+    gc.enable()
+
 
 settings.register_profile("untimed", deadline=None)
 settings.register_profile("few", deadline=None, max_examples=5)  # where another run looks for rare examples

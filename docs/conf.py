@@ -14,16 +14,15 @@ from sphinx.util import logging
 
 from ibrobot_core import __version__
 
-# The trees of pages hold millions of objects, hardly one of which goes before the end: looking for garbage among them took
-# a third of the time of a build.
-gc.disable()
-
 sys.path.insert(0, str(Path(__file__).parent))
 
 import generate
 import site_pages
 from option_pages import flags_as_code
 
+# The trees of pages hold millions of objects, hardly one of which goes before the end. To look for garbage among them
+# took half of the time of a build.
+gc.disable()
 generate.write(Path(__file__).parent)
 
 project = "ibrobot"

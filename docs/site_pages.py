@@ -58,8 +58,8 @@ def connect(app: Sphinx, generated: Mapping[str, Page], *, are_read: bool = Fals
 def make_navigation_once(app: Sphinx) -> None:
     """Give each page the navigation that Furo makes of all titles, with its own links and marks, made once for all.
 
-    Sphinx and Furo make it anew for each page, of all pages: that took more than half of the time of a build. Pages stay
-    the same.
+    Sphinx and Furo make it anew for each page, of all pages: that took half of the time of a build. The pages stay the
+    same.
     """
     made: list[str] = []
 
@@ -78,7 +78,9 @@ def make_navigation_once(app: Sphinx) -> None:
 def _navigation(app: Sphinx) -> str:
     """The navigation as the first page of the site has it: a line for each page."""
     assert isinstance(app.builder, StandaloneHTMLBuilder)
-    tree = global_toctree_for_doc(app.env, app.config.root_doc, app.builder, tags=app.tags, maxdepth=-1, titles_only=True)
+    tree = global_toctree_for_doc(
+        app.env, app.config.root_doc, app.builder, tags=app.tags, maxdepth=-1, titles_only=True
+    )
     return get_navigation_tree(app.builder.render_partial(tree)["fragment"])
 
 

@@ -27,7 +27,8 @@ from ibrobot_mujoco.state import SCENE_TOPIC
 from ibrobot_core.api import NS_PER_S, Context, EpisodeSetup, Frame, Robot, SteppedClock, Vector
 from ibrobot_core.app import find_config, installed_plugins, load_config
 
-from .test_scenes import TestHandover, begun, carry, put
+from . import test_scenes
+from .test_scenes import begun, carry, put
 
 PERIOD_NS, CHUNK_TICKS = 10_000_000, 3
 
@@ -132,7 +133,7 @@ HANDED_OVER = re.compile(r"(?:.*[TA])?[LRBEM]*LM*B[RBEM]*R")
 @pytest.mark.parametrize("holders", [3, pytest.param(4, marks=pytest.mark.long)])
 def test_every_sequence_of_holders(monkeypatch: pytest.MonkeyPatch, holders: int) -> None:
     """The bar ends in the right place in each."""
-    suite = TestHandover()
+    suite = test_scenes.TestHandover()  # its tests are not collected here again
     made = suite.make(suite.context())
     world = suite.world(made, suite.context())
     assert isinstance(made, handover.Handover)
