@@ -25,16 +25,11 @@ from ibrobot_mujoco.so101 import so101
 from ibrobot_mujoco.state import SCENE_TOPIC
 
 from ibrobot_core.api import NS_PER_S, Context, EpisodeSetup, Frame, Robot, SteppedClock, Vector
-from ibrobot_core.app import find_config, installed_plugins, load_config
 
 from . import test_scenes
-from .test_scenes import begun, carry, put
+from .test_scenes import begun, carry, put, two_arms
 
 PERIOD_NS, CHUNK_TICKS = 10_000_000, 3
-
-
-def two_arms() -> Robot:
-    return load_config(find_config("bi_so101_handover", installed_plugins())).robot
 
 
 class OneHandTask(Task):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any, ClassVar, override
 
 import mujoco
@@ -26,6 +27,12 @@ LOOKS: Mapping[str, Any] = {
     "distractors": 2,
 }
 """All that every scene can draw."""
+
+
+@cache
+def two_arms() -> Robot:
+    """The robot that the suite asks for at each beginning of an episode."""
+    return load_config(find_config("bi_so101_handover", installed_plugins())).robot
 
 
 class _Suite(MujocoSceneSuite):
@@ -90,7 +97,7 @@ class TestHandover(_Suite):
 
     @override
     def robot(self) -> Robot:
-        return load_config(find_config("bi_so101_handover", installed_plugins())).robot
+        return two_arms()
 
 
 def test_handover_needs_two_arms() -> None:
