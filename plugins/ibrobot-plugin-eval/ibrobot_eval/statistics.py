@@ -71,28 +71,30 @@ class Pairs:
 
 def wilson(successes: int, episodes: int, alpha: float = ALPHA) -> Interval:
     """Wilson's interval of a success rate. Its level is nominal on average; at some rates it is lower."""
-    return _proportion(successes, episodes, alpha, "wilson")
+    from scipy.stats import binomtest
+
+    if episodes == 0:
+        return Interval(0.0, 1.0)
+    low, high = binomtest(successes, episodes).proportion_ci(1 - alpha, "wilson")
+    return Interval(float(low), float(high))
 
 
 def clopper_pearson(successes: int, episodes: int, alpha: float = ALPHA) -> Interval:
     """The exact interval of a success rate, of Clopper and Pearson. Its level is at least nominal at every rate."""
-    return _proportion(successes, episodes, alpha, "beta")
+    from scipy.stats import beta
 
-
-def _proportion(successes: int, episodes: int, alpha: float, method: str) -> Interval:
-    from statsmodels.stats.proportion import proportion_confint
-
-    if episodes == 0:
-        return Interval(0.0, 1.0)
-    low, high = proportion_confint(successes, episodes, alpha, method)
+    failures = episodes - successes
+    low = beta.ppf(alpha / 2, successes, failures + 1) if successes else 0.0
+    high = beta.isf(alpha / 2, successes + 1, failures) if failures else 1.0
     return Interval(float(low), float(high))
 
 
 def mcnemar_exact(pairs: Pairs) -> float:
     """p-value of the exact test of McNemar. Valid for one look, after a number of episodes fixed beforehand."""
-    from statsmodels.stats.contingency_tables import mcnemar
+    from scipy.stats import binomtest
 
-    return float(mcnemar([[0, pairs.first], [pairs.second, pairs.same]], exact=True).pvalue)
+    differing = pairs.first + pairs.second
+    return float(binomtest(pairs.first, differing).pvalue) if differing else 1.0
 
 
 def tango(pairs: Pairs, alpha: float = ALPHA) -> Interval:
