@@ -212,7 +212,13 @@ def robot_arm(robot: Robot) -> Arm:
             PlanCode.COLLISION_CHECKING_UNAVAILABLE,
         )
     arm = read_arm(robot.description.mjcf, robot.joint_names, tuple(robot.description.arms.items()))
-    return attrs.evolve(arm, lower=robot.lower, upper=robot.upper)
+    return _limited(arm, tuple(robot.lower), tuple(robot.upper))
+
+
+@lru_cache(maxsize=4)
+def _limited(arm: Arm, lower: tuple[float, ...], upper: tuple[float, ...]) -> Arm:
+    """The arm within limits [rad or m]: one and the same for equal limits, so that what is found out of it is, too."""
+    return attrs.evolve(arm, lower=np.array(lower), upper=np.array(upper))
 
 
 @lru_cache(maxsize=4)

@@ -8,7 +8,9 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from types import MappingProxyType
 
 import attrs
 import numpy as np
@@ -16,7 +18,7 @@ from ibrobot_kinematics.srdf import read_srdf
 from ibrobot_kinematics.urdf import Urdf, read_urdf
 
 from ibrobot_core.api import Robot
-from ibrobot_planning.world.arm import SRDF, Arm, LinkShape, robot_arm, sorted_pair
+from ibrobot_planning.world.arm import SRDF, Arm, LinkShape, Pair, robot_arm, sorted_pair
 from ibrobot_planning.world.coal_shapes import enclosing, hull
 from ibrobot_planning.world.collision import Collisions, unchecked_pairs
 from ibrobot_planning.world.objects import World
@@ -57,7 +59,7 @@ def may_touch_arm(robot: Robot, log: logging.Logger) -> Arm:
         KinematicsError: for a URDF or SRDF that cannot be read.
     """
     arm = robot_arm(robot)
-    arm = attrs.evolve(arm, unchecked=unchecked_pairs(arm))
+    arm = attrs.evolve(arm, unchecked=_unchecked(arm))
     if robot.description.urdf is None:
         return arm
     urdf = read_urdf(robot.description.urdf)
@@ -72,6 +74,12 @@ def may_touch_arm(robot: Robot, log: logging.Logger) -> Arm:
         else:
             unchecked[sorted_pair(links[pair[0]], links[pair[1]])] = SRDF
     return attrs.evolve(arm, unchecked=unchecked, urdf_links=links)
+
+
+@lru_cache(maxsize=4)
+def _unchecked(arm: Arm) -> Mapping[Pair, str]:
+    """`unchecked_pairs`, which takes a thousand checks: a run asks for its guard and for its planner."""
+    return MappingProxyType(unchecked_pairs(arm))
 
 
 def urdf_names(arm: Arm, urdf: Urdf) -> dict[str, str]:
