@@ -233,6 +233,8 @@ class Rosbag2Reader(EpisodeReader):
     def _files(self, info: BagInfo) -> list[Path]:
         path = self._path
         if not path.is_dir():
+            if not path.exists():  # moved meanwhile
+                raise RecorderError(f"{path}: there is no such episode")
             return [path]
         listed = [path / name for name in info.files]
         for file in listed:

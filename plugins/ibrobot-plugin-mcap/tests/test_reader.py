@@ -177,6 +177,19 @@ def test_metadata_that_cannot_be_reached_are_an_error_of_the_recording(tmp_path)
         read_bag_info(path)
 
 
+def test_an_episode_that_is_moved_while_it_is_opened_is_not_there(bench, monkeypatch):
+    made = bench()
+    made.begin()
+    path = made.end()
+
+    def move(metadata):
+        path.rename(path.with_name("elsewhere"))
+
+    monkeypatch.setattr("ibrobot_mcap.reader.read_bag_info", move)
+    with pytest.raises(RecorderError, match="there is no such episode"):
+        Rosbag2Reader(path)
+
+
 def test_bags_are_known_by_their_looks(tmp_path, bench):
     assert not is_rosbag2(tmp_path)
     made = bench()
