@@ -90,7 +90,7 @@ def test_errors_are_no_failures(site: Site, how: str) -> None:
     assert (again, same) == (0, report), text
 
 
-@pytest.mark.parametrize("how", ["exit", "kill"])
+@pytest.mark.parametrize("how", ["exit", pytest.param("kill", marks=pytest.mark.long)])
 def test_a_policy_that_ends_its_process_costs_no_other_episode(site: Site, how: str) -> None:
     code, report, text = evaluate(how, every=3, episodes=4)
     check(how, code, report, text)

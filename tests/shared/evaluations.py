@@ -26,6 +26,8 @@ executors:
   all_position: {type: position, group: all}
 """
 """The beginning of the YAML of an arm of two joints, simulated by `reach`."""
+LIBRARIES = ("mujoco", "rosbags.typesys.stores.ros2_jazzy", "scipy.spatial.transform", "mcap.writer", "av", "coal")
+"""Those of an episode, which each of its processes would otherwise import for itself."""
 
 
 @contextmanager
@@ -38,7 +40,7 @@ def ready_forkserver() -> Iterator[None]:
     server: Any = forkserver._forkserver  # nothing public ends one
     server._stop()
     installed_plugins()
-    needed = ("ibrobot_core.cli.main", "ibrobot_eval.evaluation", "ibrobot_testing.fakes")
+    needed = ("ibrobot_core.cli.main", "ibrobot_eval.evaluation", "ibrobot_testing.fakes", *LIBRARIES)
     # Of other plugins the packages alone: what reads the installed plugins when it is imported would not see the site.
     plugins = (name for name in sys.modules if name.startswith("ibrobot_") and "." not in name)
     set_forkserver_preload([*needed, *plugins])
