@@ -32,10 +32,14 @@ pytestmark = pytest.mark.integration
 ROOT = Path(__file__).parents[2]
 NUMBERS = (np.nan, np.inf, -np.inf, 1e308, -1e308)
 _STILL_RAD = 2e-3
+_MORE_S = 0.5
+"""How long what rests is watched further [s]."""
 
 
 TABLE = read_table()
 CELLS = [(each, column, row.cells[column]) for row in TABLE for each in row.names for column in COLUMNS]
+BEHIND_DEVICES = ("world", "guard", "STOP")
+"""What teleoperation devices of one row share: it comes after what a device says."""
 
 
 ADAPTERS: Mapping[str, Callable[[], Entrance]] = {
@@ -100,10 +104,11 @@ ELSEWHERE: Mapping[tuple[str, str], str] = {
     ("page intervene", "older"): _PAGE,
     **{(name, "older"): _LATE for name in _SERVICES},
     **{(name, "STOP"): _LOST for name in ("source intervene", "page intervene", "/intervene")},
-    ("engine distributed", "world"): _ALIKE,
-    ("engine distributed", "guard"): _ALIKE,
-    ("engine distributed", "numbers"): _ALIKE,
-    ("engine distributed", "STOP"): _ALIKE,
+    **{
+        (f"engine {where}", column): _ALIKE
+        for where in ("process", "distributed")
+        for column in ("world", "guard", "numbers", "STOP")
+    },
     ("engine distributed", "silence"): _GONE,
     ("engine distributed", "caller dies"): _GONE,
     ("ibrobot replay", "numbers"): (
@@ -212,7 +217,7 @@ def check_guard(entrance: Entrance, cell: str) -> None:
     run = entrance.launch(CAGE)
     entrance.prepare()
     run.ticks(1, entrance.ask)
-    run.ticks(250, entrance.ask if entrance.streams else lambda: None)
+    run.ticks(150, entrance.ask if entrance.streams else lambda: None)
     session = run.session
     guard = session.config.control.guard
     assert guard is not None
@@ -228,8 +233,9 @@ def check_silence(entrance: Entrance, cell: str) -> None:
     gets_going(entrance)
     begun = len(run.commands)
     entrance.silence()
-    run.ticks(300)
-    assert run.rest_s(begun) <= seconds(cell) + entrance.ahead_s + 1e-9
+    rest_s = seconds(cell) + entrance.ahead_s
+    run.ticks(round((rest_s + _MORE_S) / run.period_s))
+    assert run.rest_s(begun) <= rest_s + 1e-9
     run.check_limits()
 
 
@@ -257,8 +263,8 @@ def check_numbers(entrance: Entrance, cell: str) -> None:
                 run.reset()
             entrance.prepare()
             begun = len(run.commands)
-            run.ticks(30 if entrance.streams else 1, ask)
-            run.ticks(40)
+            run.ticks(15 if entrance.streams else 1, ask)
+            run.ticks(20)
             run.check_limits()
             if cell == "refused" or not np.isfinite(value):
                 assert run.moved(begun) < _STILL_RAD, f"{value} at place {i} moves the robot"
@@ -272,14 +278,14 @@ def check_stop(entrance: Entrance, cell: str) -> None:
         entrance.ask()  # which waits to be carried out
     run.stop()
     begun = len(run.commands)
-    run.ticks(60, entrance.ask)
+    run.ticks(40, entrance.ask)
     assert run.rest_s(begun) <= 0.15
     if cell == "run ends":
         assert run.session.finished.is_set()
         return
     run.reset()
     begun = len(run.commands)
-    run.ticks(200, entrance.ask if cell != "emptied" else lambda: None)
+    run.ticks(100, entrance.ask if cell != "emptied" else lambda: None)
     assert run.moved(begun) < _STILL_RAD, "it moves after the reset"
     entrance.again()
     gets_going(entrance)
@@ -305,7 +311,8 @@ def check_death(entrance: Entrance, cell: str) -> None:
     gets_going(entrance)
     begun = len(run.commands)
     entrance.die()
-    run.ticks(300)
+    rest_s = 0.0 if cell in ("run ends", "goal ends") else seconds(cell) + entrance.ahead_s
+    run.ticks(300 if cell == "goal ends" else round((rest_s + _MORE_S) / run.period_s))
     if cell == "run ends":
         assert run.session.finished.is_set()
         run.runtime.stop()
@@ -314,16 +321,21 @@ def check_death(entrance: Entrance, cell: str) -> None:
     if cell == "goal ends":
         assert abs(run.commands[-1][entrance.column] - entrance.far) < 0.05, "the motion is not completed"
     else:
-        assert run.rest_s(begun) <= seconds(cell) + entrance.ahead_s + 1e-9
+        assert run.rest_s(begun) <= rest_s + 1e-9
     assert run.moved(len(run.commands) - 10) < _STILL_RAD
 
 
 def alike() -> Iterator[Any]:
-    """The cells that say something; those of an entrance that another name has, too, e.g. its device's, are `long`."""
+    """The cells that say something; what another cell shows already is `long`.
+
+    That is what an entrance has by another name, too, e.g. its device's, and what devices of one row share.
+    """
     measured: set[object] = set()
+    first = {name: row.names[0] for row in TABLE for name in row.names if name.startswith("teleop ")}
     for name, column, cell in CELLS:
         if cell != "-":
-            key = (ADAPTERS.get(name, name), TOOLS.get(name), column, cell)
+            like = first.get(name, name) if column in BEHIND_DEVICES else name
+            key = (ADAPTERS.get(like, like), TOOLS.get(like), column, cell)
             is_again = key in measured and (name, column) not in ELSEWHERE
             measured.add(key)
             marks = [pytest.mark.long] if is_again else []

@@ -784,7 +784,7 @@ class Operated(_Stream):
             if i:
                 self.run.ticks(5, self.person.hold)
             self.person.release()
-            self.run.ticks(60, self.person.rest)
+            self.run.ticks(30, self.person.rest)
             self.person.press()
 
     @override
