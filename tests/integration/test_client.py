@@ -101,7 +101,13 @@ def test_missing_robot_is_an_error(endpoint: str, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize(
-    ("end", "code"), [("", 0), ("client.close()", 0), ("sys.exit(3)", 3), ("raise ValueError", 1)],
+    ("end", "code"),
+    [
+        ("", 0),
+        pytest.param("client.close()", 0, marks=pytest.mark.long),
+        pytest.param("sys.exit(3)", 3, marks=pytest.mark.long),
+        ("raise ValueError", 1),
+    ],
     ids=["nothing", "closed", "exit", "error"],
 )  # fmt: skip
 def test_program_ends_however_it_ends(arm: Runtime, endpoint: str, end: str, code: int):

@@ -10,11 +10,13 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import chdir
 from pathlib import Path
 
 import attrs
 import click
 import pytest
+from command_line import run_here
 
 from ibrobot_core.cli.main import cli, main
 
@@ -154,10 +156,11 @@ def commands(command: click.Command = cli, names: tuple[str, ...] = ()) -> Itera
 
 
 @pytest.fixture(scope="module")
-def episode(tmp_path_factory: pytest.TempPathFactory, ibrobot: tuple[str, ...]) -> Path:
+def episode(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recorded")
     short = ("--lockstep", "--episodes", "1", "--set", "contract.max_duration_s=1")
-    subprocess.run([*ibrobot, "record", "so101_blind", "--sim", "--headless", *short], cwd=folder, check=False)
+    with chdir(folder):
+        run_here("record", "so101_blind", "--sim", "--headless", *short)
     return folder / "episodes" / "default" / "episodes" / "episode_000001"
 
 
@@ -249,7 +252,7 @@ JSON = {
     "replay BAD --json": 2,
     "convert EPISODE --out new --jobs 1 --json": 0,
     "convert BAD --out new --json": 2,
-    "eval so101_pick_cube --mode scripted --set contract.max_duration_s=0.5 --episodes 1 --out new --json": 0,
+    "eval so101_pick_cube --set contract.max_duration_s=0.1 --episodes 1 --videos 0 --out new --json": 0,
     "eval BAD --out new --json": 2,
     "config check so101 --json": 0,
     "config check BAD --json": 2,
@@ -341,16 +344,21 @@ def test_json_is_alone_on_standard_output(
         ("launch so101_blind --sim --json", "so101_blind.yaml", signal.SIGHUP),
         ("replay EPISODE --sim --json", "metadata.yaml", signal.SIGINT),
         ("convert EPISODE --out new --json", "ibrobot_data.run", signal.SIGTERM),
-        ("convert EPISODE --out new --json", "metadata.yaml", signal.SIGTERM),
-        ("config check so101 --json", "so101.yaml", signal.SIGINT),
         ("plugins --json", "ibrobot_core.plugins", signal.SIGTERM),
-        ("doctor --json", "ibrobot_core.plugins", signal.SIGHUP),
-        ("camera list --json", "list_cameras", signal.SIGINT),
-        ("episodes info EPISODE --json", "ibrobot_mcap.commands", signal.SIGTERM),
-        ("episodes info EPISODE --json", "metadata.yaml", signal.SIGHUP),
-        ("feetech monitor BAD --json", "ibrobot_feetech.bus", signal.SIGINT),
-        ("certs new --robot one", "ibrobot_zenoh.certificates", signal.SIGTERM),
-        ("serve so101_blind", "so101_blind.yaml", signal.SIGHUP),
+        *(
+            pytest.param(*case, marks=pytest.mark.long)
+            for case in (
+                ("convert EPISODE --out new --json", "metadata.yaml", signal.SIGTERM),
+                ("config check so101 --json", "so101.yaml", signal.SIGINT),
+                ("doctor --json", "ibrobot_core.plugins", signal.SIGHUP),
+                ("camera list --json", "list_cameras", signal.SIGINT),
+                ("episodes info EPISODE --json", "ibrobot_mcap.commands", signal.SIGTERM),
+                ("episodes info EPISODE --json", "metadata.yaml", signal.SIGHUP),
+                ("feetech monitor BAD --json", "ibrobot_feetech.bus", signal.SIGINT),
+                ("certs new --robot one", "ibrobot_zenoh.certificates", signal.SIGTERM),
+                ("serve so101_blind", "so101_blind.yaml", signal.SIGHUP),
+            )
+        ),
     ],
 )
 def test_signal_while_a_command_starts_is_one_line(line: str, at: str, number: signal.Signals, folder: Path) -> None:

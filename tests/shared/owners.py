@@ -169,11 +169,15 @@ def here(*arguments: object) -> None:
                 raise RuntimeError(err.getvalue()) from None
 
 
-def prepare(place: Path) -> None:
-    """An episode that was trimmed, a dataset of another one, and a part to merge into it."""
+def prepare_episode(place: Path) -> None:
+    """An episode that was trimmed."""
     episode = place / "pick/episodes/episode_000001"
     write(episode, WHOLE, 1)
     here("episodes", "trim", episode, "--in-place", "--to", "0.6")
+
+
+def prepare_datasets(place: Path) -> None:
+    """A dataset of another episode, and a part to merge into it."""
     for number, name in ((2, "set"), (3, "part")):
         write(place / "other" / name, 40, number)
         here("convert", place / "other" / name, "--out", place / name)
@@ -385,7 +389,8 @@ def run(times: int, kills: int, seed: int, only: str | None = None) -> bool:
         template = folder / "template"
         program = str(install_trainer(folder))
         vars(training_module)["find_trainer"] = lambda: program
-        aside(prepare, template)
+        prepare_episode(template)  # in this process, which thereby imports what each of its forks would import
+        aside(prepare_datasets, template)
         pairs = [pair for pair in itertools.combinations_with_replacement(COMMANDS, 2) if only is None or only in pair]
         for pair in pairs:
             tried = []
