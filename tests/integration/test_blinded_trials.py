@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING
 import pytest
 from blinded_arm import ARM, NAMES
 from command_line import run_here
+from evaluations import MINI
 from ibrobot_testing.command import command_line
 
-from ibrobot_core.config import find_config
 from ibrobot_core.plugins import installed_plugins
 
 if TYPE_CHECKING:
@@ -84,17 +84,34 @@ class Terminal:
         os.close(self._master)
 
 
+SIMULATED = (
+    MINI
+    + """\
+models:
+  model_one: {type: bad, how: poor}
+  model_two: {type: bad, how: poor}
+control_modes:
+  careful: {executors: [all_position], inference: {model: model_one}}
+  hasty: {executors: [all_position], inference: {model: model_two}}
+default_control_mode: careful
+contract:
+  rate_hz: 25
+  max_duration_s: 0.5
+  observations:
+    - {key: observation.state, topic: /joint_states, select: [position.pan, position.grip]}
+  actions:
+    - {executor: all_position, topic: /all/commands}
+control: {rate_hz: 50, stop: hold}
+"""
+)
+"""A simulated arm with two policies of which neither succeeds."""
+
+
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    text = find_config("so101_pick_cube", installed_plugins()).read_text(encoding="utf-8")
-    text = text.replace("max_duration_s: 20", "max_duration_s: 0.5")
-    text = text.replace("\nmodels:\n", "\nmodels:\n  quick: {type: scripted_pick, speed: 1.0}\n")
-    executors = "executors: [arm_position, gripper_position]"
-    pairs = zip(NAMES, ("scripted_pick", "quick"), strict=True)
-    modes = "".join(f"  {name}: {{{executors}, inference: {{model: {model}}}}}\n" for name, model in pairs)
-    (tmp_path / "arm.yaml").write_text(
-        text.replace("\ncontrol_modes:\n", f"\ncontrol_modes:\n{modes}"), encoding="utf-8"
-    )
+def folder(site: Site, tmp_path: Path) -> Path:
+    """A folder with the YAML of the simulated arm."""
+    site.add("bad-policies", "bad_policies.py")
+    (tmp_path / "arm.yaml").write_text(SIMULATED, encoding="utf-8")
     return tmp_path
 
 
@@ -145,7 +162,7 @@ def test_operator_judges_blind_and_goes_on_after_a_crash(folder: Path, terminals
     log = (out / "trials.log").read_text(encoding="utf-8")
     names = [str(path.relative_to(out)) for path in out.rglob("*")]
     assert "episode 1: failure" in log, "the log has what the run says, without names"
-    for name in (*NAMES, "scripted_pick", "quick"):
+    for name in (*NAMES, "model_one", "model_two"):
         assert name not in blind
         assert name not in log
         assert not [path for path in names if name in path]
