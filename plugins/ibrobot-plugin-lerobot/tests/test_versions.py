@@ -118,14 +118,37 @@ VERSIONS: dict[str, Callable[..., Path]] = {
 }
 
 
+class Sets:
+    """Makes datasets of each version: each is encoded once, and copied for each test.
+
+    Args:
+        folder: where those are that are copied.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def __call__(self, version: str, root: Path, **options: Any) -> Path:
+        made = self._folder / f"{version} {options}" / "set"
+        if not made.exists():
+            made.parent.mkdir()
+            VERSIONS[version](made, **options)
+        return shutil.copytree(made, root)
+
+
+@pytest.fixture(scope="module")
+def sets(tmp_path_factory: pytest.TempPathFactory) -> Sets:
+    return Sets(tmp_path_factory.mktemp("sets"))
+
+
 @pytest.fixture(params=VERSIONS, ids=lambda name: name)
 def version(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
 @pytest.mark.parametrize("options", [{"videos": False}, {"codec": "h264"}, {"codec": "hevc"}, {}], ids=str)
-def test_rows_of_every_version_are_read(version: str, options: dict[str, Any], tmp_path: Path) -> None:
-    dataset = layout.existing_dataset(VERSIONS[version](tmp_path / "set", **options))
+def test_rows_of_every_version_are_read(sets: Sets, version: str, options: dict[str, Any], tmp_path: Path) -> None:
+    dataset = layout.existing_dataset(sets(version, tmp_path / "set", **options))
     number = 0
     for episode, length in enumerate(LENGTHS):
         rows = EpisodeRows(dataset, episode)
@@ -142,8 +165,8 @@ def test_rows_of_every_version_are_read(version: str, options: dict[str, Any], t
     assert number == sum(LENGTHS)
 
 
-def test_every_version_is_shown(version: str, tmp_path: Path) -> None:
-    root = VERSIONS[version](tmp_path / "set")
+def test_every_version_is_shown(sets: Sets, version: str, tmp_path: Path) -> None:
+    root = sets(version, tmp_path / "set")
     done = run_here("datasets", "info", root)
     assert done.returncode == 0, done.stderr
     assert f"LeRobot {version[:4]}, 3 episodes, 13 frames at 30 Hz" in done.stdout
@@ -151,20 +174,20 @@ def test_every_version_is_shown(version: str, tmp_path: Path) -> None:
     assert ("note: an older version, which is read only" in done.stdout) == version.startswith("v2")
 
 
-def test_statistics_of_episodes_are_shown_as_those_of_the_whole(tmp_path: Path) -> None:
-    shown, wanted = (dataset_contents(VERSIONS[each](tmp_path / each)) for each in ("v2.1", "v3.0"))
+def test_statistics_of_episodes_are_shown_as_those_of_the_whole(sets: Sets, tmp_path: Path) -> None:
+    shown, wanted = (dataset_contents(sets(each, tmp_path / each)) for each in ("v2.1", "v3.0"))
     for mine, other in zip(shown.features, wanted.features, strict=True):
         for name in ("min", "max", "mean", "std"):
             assert mine.stats[name] == pytest.approx(other.stats[name], rel=1e-6, abs=1e-9), (mine.key, name)
-    without = dataset_contents(VERSIONS["v2.0"](tmp_path / "v2.0"))
+    without = dataset_contents(sets("v2.0", tmp_path / "v2.0"))
     assert [each.key for each in without.features] == list(FEATURES)
 
 
 @pytest.mark.parametrize("options", [{"videos": False}, {"codec": "h264"}, {}], ids=str)
 def test_every_version_becomes_the_current_one_by_merging(
-    version: str, options: dict[str, Any], tmp_path: Path
+    sets: Sets, version: str, options: dict[str, Any], tmp_path: Path
 ) -> None:
-    root = VERSIONS[version](tmp_path / "set", **options)
+    root = sets(version, tmp_path / "set", **options)
     before = content(root)
     done = run_here("datasets", "merge", root, "--out", tmp_path / "new")
     assert done.returncode == 0, done.stderr
@@ -191,9 +214,9 @@ def test_every_version_becomes_the_current_one_by_merging(
         assert mine.keys() == other.keys()
 
 
-def test_sets_of_different_versions_are_joined(tmp_path: Path) -> None:
-    sets = [make(tmp_path / f"set{i}") for i, make in enumerate(VERSIONS.values())]
-    done = run_here("datasets", "merge", *sets, "--out", tmp_path / "new")
+def test_sets_of_different_versions_are_joined(sets: Sets, tmp_path: Path) -> None:
+    made = [sets(each, tmp_path / f"set{i}") for i, each in enumerate(VERSIONS)]
+    done = run_here("datasets", "merge", *made, "--out", tmp_path / "new")
     assert done.returncode == 0, done.stderr
     new = layout.existing_dataset(tmp_path / "new")
     assert (new.info["total_episodes"], new.info["total_frames"], new.tasks) == (12, 52, ["task 0", "task 1"])
@@ -270,9 +293,11 @@ ODDITIES: dict[str, tuple[Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize("oddity", ODDITIES)
-def test_oddities_of_every_version_are_shown_and_their_tables_read(version: str, oddity: str, tmp_path: Path) -> None:
+def test_oddities_of_every_version_are_shown_and_their_tables_read(
+    sets: Sets, version: str, oddity: str, tmp_path: Path
+) -> None:
     change, words = ODDITIES[oddity]
-    root = VERSIONS[version](tmp_path / "set")
+    root = sets(version, tmp_path / "set")
     change(root)
     done = run_here("datasets", "info", root)
     assert done.returncode == 0, done.stderr
@@ -285,8 +310,8 @@ def test_oddities_of_every_version_are_shown_and_their_tables_read(version: str,
 
 
 @pytest.mark.parametrize("oddity", ["language", "channels first", "no robot", "fps with a point"])
-def test_oddities_are_kept_when_merged(version: str, oddity: str, tmp_path: Path) -> None:
-    root = VERSIONS[version](tmp_path / "set")
+def test_oddities_are_kept_when_merged(sets: Sets, version: str, oddity: str, tmp_path: Path) -> None:
+    root = sets(version, tmp_path / "set")
     ODDITIES[oddity][0](root)
     done = run_here("datasets", "merge", root, "--out", tmp_path / "new")
     assert done.returncode == 0, done.stderr
@@ -299,9 +324,9 @@ def test_oddities_are_kept_when_merged(version: str, oddity: str, tmp_path: Path
 
 @pytest.mark.parametrize("oddity", ["no videos", "a missing video", "pointers to videos"])
 def test_pictures_that_are_missing_are_an_error_where_they_are_needed(
-    version: str, oddity: str, tmp_path: Path
+    sets: Sets, version: str, oddity: str, tmp_path: Path
 ) -> None:
-    root = VERSIONS[version](tmp_path / "set")
+    root = sets(version, tmp_path / "set")
     ODDITIES[oddity][0](root)
     dataset = layout.existing_dataset(root)
     with pytest.raises(DatasetError, match=r"mp4: is missing; download the videos of the dataset too, or use a robot"):
@@ -313,8 +338,10 @@ def test_pictures_that_are_missing_are_an_error_where_they_are_needed(
 
 
 @pytest.mark.parametrize("pattern", ["meta/tasks.*", "data/*/*", "meta/info.json"])
-def test_pointers_of_git_lfs_in_place_of_tables_name_the_remedy(version: str, pattern: str, tmp_path: Path) -> None:
-    root = VERSIONS[version](tmp_path / "set")
+def test_pointers_of_git_lfs_in_place_of_tables_name_the_remedy(
+    sets: Sets, version: str, pattern: str, tmp_path: Path
+) -> None:
+    root = sets(version, tmp_path / "set")
     first, *_ = sorted(root.glob(pattern))
     pointer(first)
     done = run_here("datasets", "info", root)
@@ -323,8 +350,8 @@ def test_pointers_of_git_lfs_in_place_of_tables_name_the_remedy(version: str, pa
     assert f"`git lfs pull` in {root} downloads them" in done.stderr
 
 
-def test_episode_of_several_tasks(version: str, tmp_path: Path) -> None:
-    root = VERSIONS[version](tmp_path / "set")
+def test_episode_of_several_tasks(sets: Sets, version: str, tmp_path: Path) -> None:
+    root = sets(version, tmp_path / "set")
     if version.startswith("v2"):
         lines = [json.loads(line) for line in (root / "meta/episodes.jsonl").read_text().splitlines()]
         lines[1]["tasks"] = ["task 1", "task 0"]
@@ -352,16 +379,16 @@ def test_episode_of_several_tasks(version: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("found", ["v1.6", "v3.1", "3", None])
-def test_unknown_version_is_named_beside_all_that_can_be_read(found: str | None, tmp_path: Path) -> None:
-    root = current(tmp_path / "set")
+def test_unknown_version_is_named_beside_all_that_can_be_read(sets: Sets, found: str | None, tmp_path: Path) -> None:
+    root = sets("v3.0", tmp_path / "set")
     edit(root, lambda info: info.update(codebase_version=found))
     with pytest.raises(DatasetError, match=r"info.json: codebase_version: .* can: v2.0, v2.1, v3.0"):
         layout.existing_dataset(root)
 
 
 @pytest.mark.parametrize("template", ["../{episode_index}.parquet", "/x/{episode_index}", "{other}", "{0}", "{", 3])
-def test_paths_of_older_datasets_stay_in_them(template: object, tmp_path: Path) -> None:
-    root = VERSIONS["v2.1"](tmp_path / "set")
+def test_paths_of_older_datasets_stay_in_them(sets: Sets, template: object, tmp_path: Path) -> None:
+    root = sets("v2.1", tmp_path / "set")
     edit(root, lambda info: info.update(data_path=template))
     with pytest.raises(DatasetError, match=r"info.json: data_path: "):
         list(EpisodeRows(layout.existing_dataset(root), 0).read(["action"]))
@@ -369,8 +396,8 @@ def test_paths_of_older_datasets_stay_in_them(template: object, tmp_path: Path) 
 
 @pytest.mark.parametrize("name", ["episodes.jsonl", "tasks.jsonl", "episodes_stats.jsonl"])
 @pytest.mark.parametrize("line", ["{", "3", "[]", '{"x": 1}', "NaN"])
-def test_broken_lines_are_named(name: str, line: str, tmp_path: Path) -> None:
-    root = VERSIONS["v2.1"](tmp_path / "set")
+def test_broken_lines_are_named(sets: Sets, name: str, line: str, tmp_path: Path) -> None:
+    root = sets("v2.1", tmp_path / "set")
     with (root / "meta" / name).open("a") as file:
         file.write(line + "\n")
     done = run_here("datasets", "info", root)
@@ -382,8 +409,8 @@ def test_broken_lines_are_named(name: str, line: str, tmp_path: Path) -> None:
     assert (merged.returncode, "a bug" in merged.stderr) == (2, False), merged.stderr
 
 
-def test_training_on_an_older_version_names_the_command_that_copies_it(tmp_path: Path) -> None:
-    root = VERSIONS["v2.1"](tmp_path / "set")
+def test_training_on_an_older_version_names_the_command_that_copies_it(sets: Sets, tmp_path: Path) -> None:
+    root = sets("v2.1", tmp_path / "set")
     done = run_here("train", root, "--out", tmp_path / "out")
     assert done.returncode == 2
     assert f"`ibrobot datasets merge {root} --out {root}-v3` copies it to v3.0" in done.stderr
