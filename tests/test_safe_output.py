@@ -102,6 +102,8 @@ _RICH = {
     "inspect": "echo",
     "pretty": "echo",
 }
+_SUSPECT = re.compile(r"\b(?:rich|click\.s?echo|print|logging\.Formatter|TextColumn|Panel)\b")
+"""What a file has that shows text by another way; parsing all files takes seconds."""
 _ONE_WAY = {Path("ibrobot_core/safe_output.py"), Path("plugins/ibrobot-terminal/ibrobot_terminal/screen.py")}
 
 
@@ -142,9 +144,10 @@ def ways_around(tree: ast.AST) -> Iterator[str]:
 
 def test_all_text_goes_one_way():
     found = {
-        str(path.relative_to(ROOT)): list(ways_around(ast.parse(path.read_text(encoding="utf-8"))))
+        str(path.relative_to(ROOT)): list(ways_around(ast.parse(text))) if _SUSPECT.search(text) else []
         for path in sources()
         if path.relative_to(ROOT) not in _ONE_WAY
+        for text in [path.read_text(encoding="utf-8")]
     }
     assert len(found) > 100
     assert {path: ways for path, ways in found.items() if ways} == {}
@@ -165,6 +168,7 @@ def test_all_text_goes_one_way():
     ],
 )
 def test_the_check_finds_ways_around(code: str):
+    assert _SUSPECT.search(code)
     assert list(ways_around(ast.parse(code)))
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 from collections import defaultdict
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -61,8 +62,13 @@ SEAMS = {
 """Texts that several packages share without a library for them, and why."""
 
 
-def constants(path: Path) -> Iterator[tuple[str, str]]:
+@cache
+def constants(path: Path) -> tuple[tuple[str, str], ...]:
     """The constants of a module, in capitals: name and text."""
+    return tuple(_constants(path))
+
+
+def _constants(path: Path) -> Iterator[tuple[str, str]]:
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
         if not isinstance(node, ast.Assign):
             continue

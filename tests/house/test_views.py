@@ -50,9 +50,10 @@ def imported() -> list[tuple[str, set[str]]]:
     """Each file of the plugins, with the names that it imports from `ibrobot_core.app`."""
     found = []
     for path in PLUGINS.glob("*/*ibrobot*/**/*.py"):
+        text = path.read_text(encoding="utf-8")
         names = {
             name.name
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            for node in (ast.walk(ast.parse(text)) if "ibrobot_core.app" in text else ())
             if isinstance(node, ast.ImportFrom) and node.module == "ibrobot_core.app"
             for name in node.names
         }
