@@ -54,8 +54,9 @@ def shift_of(reference: Grey, picture: Grey, weight: Grey | None = None) -> Shif
             fitted = _refine(
                 _textures(reference, level), _textures(picture, level), _halved(weight, level), fitted, level
             )
-        moved, inside = _warp(first[1], fitted, 1)
-        quality = _correlation(first[0], moved, weight * inside) if inside.mean() > 0.3 else -1.0
+        places = _places(reference.shape, fitted, 1)
+        weights = weight * places.inside
+        quality = _correlation(first[0], places.of(first[1]), weights) if places.inside.mean() > 0.3 else -1.0
         best = max(best, (quality, fitted), key=lambda each: each[0])
     after, p = best
     height, width = reference.shape
@@ -106,19 +107,44 @@ def _coarse(reference: Grey, picture: Grey) -> list[NDArray[np.float64]]:
     return starts
 
 
-def _warp(picture: Grey, p: NDArray[np.float64], factor: int) -> tuple[Grey, Grey]:
-    """The picture at the places to which the similarity moves each pixel, and where these lie inside."""
-    height, width = picture.shape
-    rows, columns = np.mgrid[0:height, 0:width].astype(np.float64)
+@attrs.frozen(eq=False)
+class _Places:
+    """Where a similarity moves each pixel of a picture."""
+
+    first: NDArray[np.intp]
+    """Index of the pixel above and to the left, shape (H, W)."""
+    right: Grey
+    """How far it lies from there to the next pixel, 0 to 1, shape (H, W)."""
+    down: Grey
+    inside: NDArray[np.bool_]
+    """Which places lie in the picture, shape (H, W)."""
+
+    def of(self, picture: Grey) -> Grey:
+        """The picture at these places, shape (H, W)."""
+        values, width = picture.ravel(), picture.shape[1]
+        here, below = values.take(self.first), values.take(self.first + width)
+        upper = here + (values.take(self.first + 1) - here) * self.right
+        lower = below + (values.take(self.first + width + 1) - below) * self.right
+        moved: Grey = upper + (lower - upper) * self.down
+        return moved
+
+
+def _places(shape: tuple[int, ...], p: NDArray[np.float64], factor: int) -> _Places:
+    height, width = shape
+    columns, rows = np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64)[:, None]
     x, y = columns - width / 2, rows - height / 2
-    at_x = columns + p[0] / factor + p[2] * x - p[3] * y
-    at_y = rows + p[1] / factor + p[3] * x + p[2] * y
+    at_x = (columns + p[0] / factor + p[2] * x) - p[3] * y
+    at_y = (rows + p[1] / factor + p[2] * y) + p[3] * x
     inside = (at_x >= 0) & (at_x <= width - 1) & (at_y >= 0) & (at_y <= height - 1)
-    x0, y0 = np.clip(at_x.astype(int), 0, width - 2), np.clip(at_y.astype(int), 0, height - 2)
-    fx, fy = np.clip(at_x - x0, 0, 1), np.clip(at_y - y0, 0, 1)
-    upper = picture[y0, x0] * (1 - fx) + picture[y0, x0 + 1] * fx
-    lower = picture[y0 + 1, x0] * (1 - fx) + picture[y0 + 1, x0 + 1] * fx
-    return (upper * (1 - fy) + lower * fy).astype(np.float32), inside.astype(np.float32)
+    at_x, at_y = np.clip(at_x, 0, width - 1), np.clip(at_y, 0, height - 1)
+    x0, y0 = np.minimum(at_x.astype(np.intp), width - 2), np.minimum(at_y.astype(np.intp), height - 2)
+    return _Places(y0 * width + x0, (at_x - x0).astype(np.float32), (at_y - y0).astype(np.float32), inside)
+
+
+def _inside(places: _Places, shown: Grey | None) -> Grey:
+    """How much of each pixel is inside and shown."""
+    inside = places.inside.astype(np.float32)
+    return inside if shown is None else inside * places.of(shown)
 
 
 def _refine(
@@ -132,9 +158,8 @@ def _refine(
     rows, columns = np.mgrid[0:height, 0:width].astype(np.float64)
     x, y = (columns - width / 2).ravel(), (rows - height / 2).ravel()
     for _ in range(_STEPS):
-        moved, inside = _warp(picture, p, factor)
-        if shown is not None:
-            inside = inside * _warp(shown, p, factor)[0]
+        places = _places(reference.shape, p, factor)
+        moved, inside = places.of(picture), _inside(places, shown)
         down, across = np.gradient(moved)
         gx, gy = across.ravel(), down.ravel()
         residual = (moved - reference).ravel()
@@ -171,6 +196,11 @@ _RICH = 5.0
 """Deviation of the grey values from which an area shows something."""
 _ALIKE = 0.6
 """Correlation from which an area shows the same."""
+_MOST = 0.7
+"""Share of the areas that settles an alignment: what repeats itself in a picture may fit elsewhere, but in fewer."""
+
+type _Fit = tuple[int, float, NDArray[np.float64], NDArray[np.bool_]]
+"""How many areas an alignment finds, its quality, the similarity, and which areas these are."""
 
 
 @attrs.frozen(eq=False)
@@ -220,25 +250,30 @@ def moved_of(reference: Grey, picture: Grey, weight: Grey, shown: Grey) -> Moved
         return Moved(0.0, 0.0, 0, 0, 0)
     levels = {level: (_textures(reference, level), _textures(picture, level)) for level in _LEVELS}
     rich = rich_areas(reference, weight)
-    still, at = np.zeros(4), _alike(*levels[1], weight, shown, np.zeros(4), rich)
-    best = (int(at.sum()), _quality(*levels[1], weight, shown, still), still, at)
-    in_place, coarse = best[0], []
-    starts = [still, *_coarse(_halved(reference, 4) * _halved(weight, 4), _halved(picture, 4) * _halved(shown, 4))]
-    for begin in starts:
-        for turn in _TURNS:
-            start = begin + np.array([0.0, 0.0, np.cos(turn) - 1, np.sin(turn)])
-            fitted = _refine(*levels[4], _halved(weight, 4), start, 4, _halved(shown, 4))
-            coarse.append((_quality(*levels[4], _halved(weight, 4), _halved(shown, 4), fitted, 4), fitted))
-    coarse.sort(key=lambda each: -each[0])
-    for _, fitted in [(0.0, still), *coarse[:2]]:
-        p = fitted
+    still = np.zeros(4)
+
+    def fit(p: NDArray[np.float64]) -> _Fit:
+        alike = _alike(*levels[1], weight, shown, p, rich)
+        return int(alike.sum()), _quality(*levels[1], weight, shown, p), p, alike
+
+    def refined(p: NDArray[np.float64]) -> _Fit:
         for level in _LEVELS[1:]:
             p = _refine(*levels[level], _halved(weight, level), p, level, _halved(shown, level))
-        alike = _alike(*levels[1], weight, shown, p, rich)
-        best = max(
-            best, (int(alike.sum()), _quality(*levels[1], weight, shown, p), p, alike),
-            key=lambda each: each[:2],
-        )  # fmt: skip
+        return fit(p)
+
+    fits = [fit(still), refined(still)]
+    in_place = fits[0][0]
+    if max(each[0] for each in fits) < _MOST * rich.sum():  # else no other alignment finds more
+        coarse = []
+        seen = [_halved(each, 4) for each in (reference, weight, picture, shown)]
+        for begin in (still, *_coarse(seen[0] * seen[1], seen[2] * seen[3])):
+            for turn in _TURNS:
+                start = begin + np.array([0.0, 0.0, np.cos(turn) - 1, np.sin(turn)])
+                fitted = _refine(*levels[4], seen[1], start, 4, seen[3])
+                coarse.append((_quality(*levels[4], seen[1], seen[3], fitted, 4), fitted))
+        coarse.sort(key=lambda each: -each[0])
+        fits += [refined(fitted) for _, fitted in coarse[:2]]
+    best = max(fits, key=lambda each: each[:2])
     matches, _, p, alike = best
     # What is found all over the picture tells of all of it, also of a turn about its middle.
     spread = matches >= 8 and alike.any(axis=1).sum() >= 3 and alike.any(axis=0).sum() >= 4
@@ -252,9 +287,9 @@ def moved_of(reference: Grey, picture: Grey, weight: Grey, shown: Grey) -> Moved
 def _quality(
     reference: Grey, picture: Grey, weight: Grey, shown: Grey, p: NDArray[np.float64], factor: int = 1
 ) -> float:
-    moved, inside = _warp(picture, p, factor)
-    inside = inside * _warp(shown, p, factor)[0]
-    return _correlation(reference, moved, weight * inside) if inside.mean() > 0.3 else -1.0
+    places = _places(reference.shape, p, factor)
+    inside = _inside(places, shown)
+    return _correlation(reference, places.of(picture), weight * inside) if inside.mean() > 0.3 else -1.0
 
 
 def areas_of(values: Grey) -> Grey:
@@ -294,8 +329,8 @@ def _alike(
     least: float = 0.3,
 ) -> NDArray[np.bool_]:  # fmt: skip
     """The rich areas that show the same once the picture is aligned."""
-    moved, inside = _warp(picture, p, 1)
-    weights = areas_of(weight * inside * _warp(shown, p, 1)[0])
+    places = _places(reference.shape, p, 1)
+    moved, weights = places.of(picture), areas_of(weight * _inside(places, shown))
     total = weights.sum(axis=2) + 1e-6
     a, b = (each - ((each * weights).sum(axis=2) / total)[..., None] for each in (areas_of(reference), areas_of(moved)))
     norm = np.sqrt((weights * a * a).sum(axis=2) * (weights * b * b).sum(axis=2)) + 1e-9
