@@ -23,26 +23,23 @@ def episode(tmp_path_factory):
     done = run_here(
         "launch", "so101_blind", "--sim", "--headless", "--lockstep", "--episodes", 1, "--seed", 5,
         "--set", f"recording.root={root}", "--set", "recording.type=mcap",
+        "--set", "contract.max_duration_s=4",
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    assert done.returncode in (0, 3), done.stderr  # its time may be too short for the task
     return next(root.glob("*/episodes/episode_000001"))
 
 
-def test_answers_are_equal_bit_for_bit(episode):
-    (explained,) = json.loads(run_here("explain", episode, "--model", ".", "--json").stdout)
+def test_answers_are_equal_bit_for_bit_and_libraries_warn_of_nothing(episode):
+    command = [*ibrobot_command(), "explain", str(episode), "--model", ".", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "Warning" not in done.stderr, "observations that cannot be, e.g. a quaternion of zeros, make libraries warn"
+    (explained,) = json.loads(done.stdout)
     model = explained["model"]
     assert model["asked"] >= 5
     assert (model["equal"], model["whose"]) == (model["asked"], "")
     changed = {each["what"] for each in model["effects"]}
     assert {each for each in changed if not each.startswith("state ")} == {"state", "environment_state"}
     assert explained["causes"] == []
-
-
-def test_observations_that_cannot_be_print_no_warnings_of_libraries(episode):
-    command = [*ibrobot_command(), "explain", str(episode), "--model", "."]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert "How far its answers move" in done.stdout
-    assert "Warning" not in done.stderr, "e.g. of a quaternion of zeros"
 
 
 def test_unknown_model_is_named(episode):

@@ -20,7 +20,14 @@ pytestmark = [
     pytest.mark.skipif(not _RENDERS, reason="needs ibrobot-plugin-mujoco, and OpenGL"),
 ]
 
-SIM = ("so101", "--sim", "--lockstep", "--seconds", "0.5")
+SMALL = [
+    part
+    for camera in ("top", "wrist")
+    for each in ("fps=10", "width=320", "height=240")
+    for part in ("--set", f"peripherals.{camera}.{each}")
+]
+"""A twelfth of the pixels, which take most of the time."""
+SIM = ("so101", "--sim", "--lockstep", "--seconds", "0.5", *SMALL)
 
 
 def preflight(*arguments):
@@ -127,18 +134,13 @@ def test_fault_of_the_run_fails(reference):
     assert "FAIL  joints_unwell: " in done.stdout
 
 
-def test_events_tell_what_is_done(reference):
-    done = run_here("preflight", *SIM, "--against", reference, "--events")
-    events = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [each["event"] for each in events][-1] == "preflightreport"
-    assert events[-1]["verdict"] == "ok"
-    assert {"control", "the window"} <= {each["what"] for each in events[:-1]}
-
-
-def test_events_tell_each_difference_with_its_number_and_remedy(reference, tmp_path):
+def test_events_tell_what_is_done_and_each_difference_with_its_number_and_remedy(reference, tmp_path):
     other = changed(reference, tmp_path / "other.json", lambda rig: rig.update(robot="koch"))
     done = run_here("preflight", *SIM, "--against", other, "--events")
     events = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [each["event"] for each in events][-1] == "preflightreport"
+    assert events[-1]["verdict"] == "warn"
+    assert {"control", "the window"} <= {each["what"] for each in events[:-1] if "what" in each}
     (differs,) = [each for each in events if each["event"] == "difference"]
     assert (differs["name"], differs["verdict"]) == ("other_robot", "warn")
     assert differs["limits"] == "[1 difference; warns from 1, fails from 2]"
