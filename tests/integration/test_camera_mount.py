@@ -6,8 +6,10 @@ import os
 import shutil
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
+import attrs
 import numpy as np
 import pytest
 import yaml
@@ -173,7 +175,7 @@ def write_episodes(folder: Path) -> None:
     from ibrobot_ros2.jpeg import to_jpeg
     from ibrobot_testing import host_context
 
-    from ibrobot_core.api import CameraInfo, EpisodeEnd, EpisodeStart, Header, Image, JointState
+    from ibrobot_core.api import CameraInfo, CompressedImage, EpisodeEnd, EpisodeStart, Header, Image, JointState
     from ibrobot_core.app import find_config, installed_plugins, load_config
 
     assert abs(MATRIX[0, 0] - FOCAL) < 1e-9
@@ -190,6 +192,16 @@ def write_episodes(folder: Path) -> None:
             placed = each.board @ slipped(rng) if number in (3, 11) else each.board
             shown.append(scene.picture(joints, placed))
         between = scene.picture(USUAL["in hand"], each.board)
+    pictures = {id(picture): picture for picture in (*shown, between)}
+
+    @cache  # most pictures are shown several times
+    def encoded(number: int, blurred: bool) -> CompressedImage:
+        picture = pictures[number]
+        if blurred:
+            picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 9), np.uint8)
+        data = np.ascontiguousarray(picture).reshape(-1)
+        return to_jpeg(Image(Header(0), HEIGHT, WIDTH, "rgb8", 3 * WIDTH, data), 90)
+
     for name in ("good", "still", "bare", "blurred"):
         recorder = McapRecorder(McapOptions(), host_context())
         recorder.begin(EpisodeStart(folder / name, 1_000_000_000, {}, {}, any_topic=True))
@@ -206,13 +218,11 @@ def write_episodes(folder: Path) -> None:
                     recorder.write(
                         "/joint_states", JointState(Header(stamp_ns), config.robot.joint_names, at), stamp_ns
                     )
-                picture = between if moves and name != "still" else seen
-                if name == "blurred":
-                    picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 9), np.uint8)
                 if step % 6 == 0:
+                    picture = between if moves and name != "still" else seen
                     header = Header(now_ns, "wrist_optical_frame")
-                    image = Image(header, HEIGHT, WIDTH, "rgb8", 3 * WIDTH, np.ascontiguousarray(picture).reshape(-1))
-                    recorder.write("/camera/wrist/image_raw", to_jpeg(image, 90), now_ns)
+                    compressed = attrs.evolve(encoded(id(picture), name == "blurred"), header=header)
+                    recorder.write("/camera/wrist/image_raw", compressed, now_ns)
         recorder.end(EpisodeEnd(now_ns, "success"))
         recorder.close()
 

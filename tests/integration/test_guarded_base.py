@@ -123,7 +123,7 @@ def test_without_the_guard_it_drives_into_it(monkeypatch) -> None:
     drive.close()
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(2, 6))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(1, 6))])
 def test_no_twist_leads_into_anything(monkeypatch, seed: int) -> None:
     """Twists of all three axes among boxes; wheels that reach 60 to 100 % of what they are sent."""
     rng = np.random.default_rng(seed)
@@ -160,7 +160,7 @@ def test_the_pose_is_the_sum_of_ways() -> None:
         ways, reference = BaseWays(np.arange(len(axes)), axes), np.zeros(3)
         at = np.zeros(len(axes))
         ways.note(at)
-        for _ in range(100):
+        for _ in range(25):
             step = rng.uniform(-0.05, 0.05, len(axes))
             ahead = ways.path(np.stack([at, at + step]))[-1]
             whole = np.zeros(3)
@@ -228,7 +228,7 @@ def hostile_twists(drive: Any, rng: np.random.Generator) -> Iterator[None]:
         twist[axis] = wrong
         drive.drive(twist, 0.3)
         yield
-    for _ in range(15):
+    for _ in range(10):
         for _ in range(8):
             drive.twist = driving.FASTEST * rng.choice([-9.0, -1.0, 1.0, 9.0], 3)
             drive.tick(rng.uniform(0.01, 0.2))
@@ -250,7 +250,7 @@ def hostile_readings(drive: Any, rng: np.random.Generator) -> Iterator[None]:
 
 def hostile_wheels(drive: Any, rng: np.random.Generator) -> Iterator[None]:
     """Wheels that reach a share of their velocity that changes all the time, or none."""
-    for _ in range(30):
+    for _ in range(15):
         drive.twist = driving.FASTEST * rng.uniform(-1, 1, 3)
         for _ in range(6):
             drive.world.wheels.share = rng.choice([0.0, 0.3, 0.8, 1.0, 1.1])
@@ -289,7 +289,7 @@ def hostile_worlds(drive: Any, rng: np.random.Generator) -> Iterator[None]:
 
 def hostile_stops(drive: Any, rng: np.random.Generator) -> Iterator[None]:
     """Stops and resets in motion, and a program that falls silent."""
-    for number in range(30):
+    for number in range(24):
         drive.drive(driving.FASTEST * rng.uniform(-1, 1, 3), rng.uniform(0.1, 0.8))
         if number % 3:
             drive.stop()

@@ -82,7 +82,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
 }  # fmt: skip
 
 
-SLOW = ("names exchanged", "parallel joints exchanged", "reversed", "large squares", "small squares",
+SLOW = ("board moved", "names exchanged", "parallel joints exchanged", "reversed", "large squares", "small squares",
         "an arm that lies", "half of them wrong")  # fmt: skip
 """Sessions of which the search tries many explanations."""
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import override
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, override
 
 import attrs
 import numpy as np
@@ -31,6 +31,11 @@ SAVED = (
     "homing_offset", "min_position_limit", "max_position_limit", "torque_limit", "goal_velocity", "acceleration",
     "torque_enable", "lock", "operating_mode", "max_torque", "p_coefficient",
 )  # fmt: skip
+
+
+def siblings(every: Iterable[int], step: int) -> list[Any]:
+    """Parameters of a test, of which one in `step` is in the short run."""
+    return [pytest.param(each, marks=[pytest.mark.long] * (i % step > 0)) for i, each in enumerate(every)]
 
 
 class Operator(FakeGuide):
@@ -169,7 +174,7 @@ def test_whole_arm_finds_its_stops_joint_by_joint(emulator):
         assert rig.emulator.servos[joint.servo].encoder == pytest.approx(MIDDLE, abs=170)
 
 
-@pytest.mark.parametrize("middle", [30, 700, 3400, 4090])
+@pytest.mark.parametrize("middle", siblings((30, 700, 3400, 4090), 3))
 def test_range_that_crosses_the_end_of_the_encoder_is_found(rig, middle):
     for joint in rig.joints:
         emulated = rig.emulator.servos[joint.servo]
@@ -354,8 +359,8 @@ def test_arm_that_moves_by_itself_is_refused(rig):
         rig.calibrate()
 
 
-@pytest.mark.parametrize("reading", [*range(1, 40, 6), *range(60, 900, 105)])
 @pytest.mark.parametrize("held", [False, True])
+@pytest.mark.parametrize("reading", siblings((*range(1, 40, 6), *range(60, 900, 105)), 3))
 def test_operator_stops_it_at_any_time_and_the_servos_are_as_they_were(rig, reading, held):
     for servo in rig.emulator.servos.values():
         servo.set("torque_limit", 250 if held else 1000)
@@ -438,7 +443,7 @@ def oddity(rng: np.random.Generator, rig: Rig) -> str:
     return str(kind)
 
 
-@pytest.mark.parametrize("seed", [*range(12), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(12, 24))])
+@pytest.mark.parametrize("seed", siblings(range(24), 4))
 def test_odd_arm_is_measured_right_or_refused(rig, seed):
     """Siblings of the oddities above: whatever is odd, no range is wrong, and no torque above the stated one."""
     kind, before = oddity(np.random.default_rng(seed), rig), rig.registers()

@@ -66,7 +66,7 @@ def test_any_beginning_of_a_file_can_be_read(unfinished, tmp_path_factory):
     path = tmp_path_factory.mktemp("cut") / "file.mcap"
     counts = {}
 
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=20, deadline=None)
     @given(st.integers(0, len(whole)) | st.integers(len(whole) - 100, len(whole)))
     def check(length):
         path.write_bytes(whole[:length])
