@@ -89,7 +89,7 @@ REMEDIES = {
     "ibrobot launch --web": "tests/shared/page_run.py::page_run",  # by the tests of the page
     "ibrobot launch X --sim --mode web --web": "tests/shared/page_run.py::page_run",
     "ibrobot replay X CONFIG": "tests/integration/test_replay.py::test_joint_log_of_an_episode_is_replayed",
-    "ibrobot ui FOLDER": f"{_WEB}/test_ui_path.py::test_from_a_robot_to_its_dataset_by_clicks_alone",
+    "ibrobot ui FOLDER": f"{_WEB}/test_ui_path.py::test_from_a_robot_to_its_dataset_without_a_terminal",
 }
 """Command that a message of these packages names -> the test that runs it; see `test_a_test_runs_each_remedy`."""
 _MADE_FROM = {"tool": "ibrobot feetech"}

@@ -53,7 +53,7 @@ def make_evaluation(out: Path) -> str:
 
 def test_an_evaluation_is_looked_at_on_the_page(tmp_path: Path) -> None:
     sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
-    from ui_path import FLAGS, plays, ui_process, until
+    from ui_path import FLAGS, SMALL, plays, ui_process, until
 
     written = make_evaluation(tmp_path / "night")
     (tmp_path / "broken").mkdir()
@@ -62,7 +62,7 @@ def test_an_evaluation_is_looked_at_on_the_page(tmp_path: Path) -> None:
     errors: list[str] = []
     with ui_process(tmp_path) as address, sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        page = browser.new_context().new_page()
+        page = browser.new_context(**SMALL).new_page()
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda line: errors.extend([line.text] * (line.type == "error")))
         page.goto(address)

@@ -17,6 +17,8 @@ from page_run import IBROBOT
 
 ROOT = Path(__file__).parents[2]
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]
+SMALL = {"device_scale_factor": 0.25}
+"""Of a browser's page: software draws it, so a sixteenth of the pixels, in the same layout."""
 _WAIT_MS = 60_000
 Shot = Callable[[Any, str], None]
 """Takes a screenshot of a page, by name."""
@@ -68,6 +70,17 @@ def until(page: Any, expression: str) -> None:
         page.wait_for_timeout(50)
 
 
+def reach(page: Any, element: Any) -> None:
+    """Go to an element by the tab key."""
+    element.wait_for()
+    for _ in range(120):
+        if element.evaluate("each => each === document.activeElement"):
+            assert element.evaluate("each => each.matches(':focus-visible')"), "the focus is visible"
+            return
+        page.keyboard.press("Tab")
+    raise AssertionError(f"{element}: not reached by the tab key")
+
+
 def press(page: Any, label: str, expression: str) -> None:
     """Hold a button until an expression is true; press again as a person does, since a page that stalls releases it."""
     page.get_by_label(label).hover()
@@ -83,7 +96,10 @@ def press(page: Any, label: str, expression: str) -> None:
 
 
 def record(page: Any, shot: Shot = lambda page, name: None) -> None:
-    """Choose the robot, launch a session that records it, jog, and record and judge two episodes."""
+    """Choose the robot, launch a session that records it, jog, and record and judge two episodes.
+
+    The second one begins and is judged by keys.
+    """
     page.context.set_default_timeout(_WAIT_MS)  # Playwright's 30 s are too short for software that draws beside a run
     page.get_by_role("link", name="Robots").click()
     page.get_by_label("Robot", exact=True).select_option("my_arm.yaml")
@@ -103,7 +119,11 @@ def record(page: Any, shot: Shot = lambda page, name: None) -> None:
     until(run, "window.ibrobot?.jogs.length && ibrobot.status.episode")
     # Joints that meet nothing, however long a busy machine takes to release the button.
     for number, (joint, index, verdict) in enumerate([("shoulder_pan", 0, "Success"), ("wrist_roll", 4, "Failure")]):
-        run.get_by_role("button", name="Begin").click()
+        if number == 0:
+            run.get_by_role("button", name="Begin").click()
+        else:
+            until(run, "ibrobot.status.episode.recording === false")
+            run.keyboard.press("b")
         before = run.evaluate("ibrobot.state.position")
         moved = f"Math.abs(ibrobot.state.position[{index}] - {before[index]}) > 0.3"
         moved = f"ibrobot.status.episode.elapsed_s > 1 && {moved}"
@@ -111,13 +131,19 @@ def record(page: Any, shot: Shot = lambda page, name: None) -> None:
         if number == 0:
             shot(run, "episode")
         run.mouse.up()
-        run.get_by_role("button", name=verdict).click()
         if number == 0:
+            run.get_by_role("button", name=verdict).click()
             until(run, "ibrobot.status.episode.saved === 1")
+        else:
+            run.get_by_role("button", name=verdict).wait_for()
+            run.keyboard.press(verdict[0].lower())
     page.locator(".job .state:not(.running)").first.wait_for(timeout=_WAIT_MS)
     assert page.locator(".job .state.done").count() == 1, page.locator(".job").all_inner_texts()
     until(run, "ibrobot.status.ended")
     assert "2 of 2 saved" in run.locator("#faults .ended").inner_text()
+    until(run, "ibrobot.connected === false")
+    assert run.locator("#faults .fault, #connection.bad").count() == 0, "an end is no alarm"
+    assert run.locator("#stop").is_disabled()
     shot(run, "ended")
     assert run.get_by_role("link", name="Judge and convert").get_attribute("href").startswith(page.url.split("#")[0])
     run.close()

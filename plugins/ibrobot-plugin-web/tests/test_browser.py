@@ -7,7 +7,6 @@ import math
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -353,52 +352,3 @@ def test_a_goal_is_previewed_before_it_is_executed(tab: Tab) -> None:
     tab.page.get_by_role("button", name="Go", exact=True).click()
     tab.until(lambda: abs(tab.position(1) + 1.57) < 0.05)
     tab.enter("drive from the page", "web")
-
-
-@pytest.fixture
-def recorded(tmp_path: Path) -> Iterator[str]:
-    from page_run import SO101, page_run
-
-    arguments = (*SO101, *PATIENT, "--dataset", "pick", "--episodes", "2", "--set", "contract.max_duration_s=900")
-    with page_run(*arguments, command=("record",), folder=tmp_path) as found:
-        yield found
-
-
-def test_an_operator_records_by_keys_until_the_run_ends(chromium: Any, recorded: str) -> None:
-    tab = Tab(chromium, recorded)
-    keyboard = tab.page.keyboard
-    tab.until(lambda: tab.ask("ibrobot.jogs.length > 0 && Object.keys(ibrobot.cameras.frames).length === 2"))
-
-    tab.page.set_viewport_size({"width": 1280, "height": 800})
-    for key, large in (("2", "top"), ("3", "wrist"), ("1", "3D")):
-        keyboard.press(key)
-        assert tab.ask("document.querySelector('.attention').dataset.name") == large
-    tab.page.get_by_label("Task").fill("pick b")  # a letter that is typed begins nothing
-    tab.page.get_by_label("Task").blur()
-    mouse = tab.page.mouse
-
-    def begin() -> None:
-        keyboard.press("b")
-        tab.until(lambda: tab.ask("ibrobot.status.episode.waiting"))
-        tab.page.get_by_label("wrist_roll up, hold to move").hover()
-        tab.hold(mouse.down, mouse.up, lambda: tab.ask("ibrobot.status.episode.recording"))
-        mouse.up()
-
-    for key, saved in (("d", 0), ("s", 1)):
-        begin()
-        assert tab.ask("ibrobot.status.episode.prompt") == "pick b"
-        tab.until(lambda: tab.page.get_by_role("button", name="Discard").is_visible())
-        keyboard.press(key)
-        tab.until(lambda: not tab.ask("ibrobot.status.episode.recording"))
-        tab.until(lambda saved=saved: tab.text("#record .line > p").startswith(f"{saved} of 2 saved"))  # type: ignore[misc]
-    tab.until(lambda: tab.page.get_by_role("button", name="Begin").is_visible())
-    begin()
-    tab.until(lambda: tab.page.get_by_role("button", name="Failure").is_visible())
-    keyboard.press("f")
-    tab.until(lambda: tab.page.locator("#faults .ended").is_visible())
-    assert tab.text("#faults .ended").split("\n") == ["The run has ended", "2 of 2 saved"]
-    tab.until(lambda: tab.ask("ibrobot.connected === false"))
-    assert tab.page.locator("#faults .fault, #connection.bad").count() == 0, "an end is no alarm"
-    assert tab.page.locator("#stop").is_disabled()
-    tab.errors = [each for each in tab.errors if "WebSocket connection" not in each]  # the page tries again
-    tab.close()

@@ -141,12 +141,12 @@ SAID = """async (text) => (await import("/static/words.js")).words(text)"""
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
 def test_no_english_sentence_is_left_in_a_chinese_browser(tmp_path: Path) -> None:
     sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
-    from ui_path import FLAGS, own_robot, ui_process, until
+    from ui_path import FLAGS, SMALL, own_robot, ui_process, until
 
     own_robot(tmp_path)
     with ui_process(tmp_path) as address, sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        page = browser.new_page(locale="zh-CN")
+        page = browser.new_page(locale="zh-CN", **SMALL)
         errors: list[str] = []
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(address)

@@ -31,14 +31,14 @@ def opened(folder: Path) -> Iterator[Any]:
     """The page in a browser, in a folder with a robot and recordings `pick` and `place`."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
     from made_runs import Run, record_run
-    from ui_path import FLAGS, own_robot, ui_process
+    from ui_path import FLAGS, SMALL, own_robot, ui_process
 
     own_robot(folder)
     for task in ("pick", "place"):
         record_run(folder / f"episodes/{task}/episodes/episode_000001", Run(seed=1, acts=False, seconds=2, cameras=()))
     with ui_process(folder) as address, sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        page = browser.new_page()
+        page = browser.new_page(**SMALL)
         page.context.set_default_timeout(WAIT_MS)
         page.goto(address)
         page.get_by_text("No problems found.").wait_for()

@@ -1,4 +1,4 @@
-"""The page of `ibrobot ui` in headless Chromium: by clicks alone from choosing a robot to its dataset."""
+"""The page of `ibrobot ui` in headless Chromium: from choosing a robot to its dataset without a terminal."""
 
 from __future__ import annotations
 
@@ -48,16 +48,16 @@ def look_on_a_phone(page: Any) -> None:
     assert '"Outcome: "' in named
 
 
-def test_from_a_robot_to_its_dataset_by_clicks_alone(tmp_path: Path) -> None:
+def test_from_a_robot_to_its_dataset_without_a_terminal(tmp_path: Path) -> None:
     sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
-    from ui_path import FLAGS, convert, own_robot, record, ui_process
+    from ui_path import FLAGS, SMALL, convert, own_robot, record, ui_process
 
     own_robot(tmp_path)
     errors: list[str] = []
     hosts: set[str] = set()
     with ui_process(tmp_path) as address, sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        page = browser.new_page(device_scale_factor=0.5)  # software draws it
+        page = browser.new_page(**SMALL)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda line: errors.extend([f"{line.text} {line.location}"] * (line.type == "error")))
         page.on("request", lambda request: hosts.add(request.url.split("/")[2]))
