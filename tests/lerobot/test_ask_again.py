@@ -211,7 +211,8 @@ def test_policy_that_ignores_its_pictures_is_named(root: Path, recorded: Any) ->
     assert changes["top and wrist"] == {"exchanged"}
 
 
-def test_attention_is_shown_over_the_pictures(recorded: Any, tmp_path: Path) -> None:
+def test_attention_is_shown_over_the_pictures(recorded: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ibrobot_diagnose.ask_again._MOST", 2)  # of the effects, the test above
     episode = recorded("act")
     model = model_of(read_episode(episode), episode, "")
     model.load()

@@ -177,7 +177,7 @@ def network(policy: LeRobotPolicy) -> torch.nn.Module:
 @pytest.mark.parametrize(("name", "runs"), [("act", 1), ("diffusion", 3), ("vqbet", 1)])
 def test_a_batch_is_one_run(folders: dict[str, Path], name: str, runs: int) -> None:
     policy = loaded(folders[name])
-    batch = [policy.preprocess(frame) for frame in frames(policy, 8)]
+    batch = [policy.preprocess(frame) for frame in frames(policy, 4)]
     calls: list[int] = []
     hook = network(policy).register_forward_hook(lambda *_: calls.append(1))
     together = [policy.postprocess(each) for each in policy.infer_batch(batch)]
@@ -185,7 +185,7 @@ def test_a_batch_is_one_run(folders: dict[str, Path], name: str, runs: int) -> N
     assert len(calls) == runs
     alone = [policy.postprocess(policy.infer(tensors)) for tensors in batch]
     assert np.abs(np.stack(together) - np.stack(alone)).max() < TOLERANCE
-    assert len({chunk.tobytes() for chunk in together}) == 8, "each request has its own actions"
+    assert len({chunk.tobytes() for chunk in together}) == 4, "each request has its own actions"
     backwards = [policy.postprocess(each) for each in policy.infer_batch(batch[::-1])][::-1]
     assert np.abs(np.stack(backwards) - np.stack(alone)).max() < TOLERANCE
 
@@ -429,6 +429,7 @@ class TestAct(Conformance):
     name = "act"
 
 
+@pytest.mark.long  # of what it has beyond `act`, its noise, the tests above and below are about
 class TestDiffusion(Conformance):
     name = "diffusion"
     ignores = frozenset({"observation.images.top", "observation.state"})  # untrained, it draws what is clipped anyway

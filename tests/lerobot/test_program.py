@@ -99,6 +99,7 @@ def test_commands_drive_a_simulated_robot(run: Callable[..., None], tmp_path: Pa
     run("teleoperate", *ROBOT, *WAVING, "--fps=30", "--teleop_time_s=1")
 
 
+@pytest.mark.long  # in stepped time: tests/integration/test_entrances.py, lerobot-robot-ibrobot
 def test_the_guard_stops_what_a_program_of_lerobot_sends(run: Callable[..., None], tmp_path: Path) -> None:
     """The wave goes 17 degrees to either side; a wall beside the hand leaves less of one."""
     wall = "world.objects={wall: {shape: box, size: [0.3, 0.02, 0.3], position: [0.3, 0.09, 0.15]}}"
