@@ -80,7 +80,7 @@ class LeakCheck:
     def _join_threads(self, before: _Found, deadline: float) -> None:
         """Wait for ending threads."""
         if "thread" not in self.allow:
-            for thread in _Found.now().threads - before.threads:
+            for thread in _threads() - before.threads:
                 thread.join(max(0.0, deadline - time.monotonic()))
 
     def _left_since(self, before: _Found) -> list[str]:
@@ -102,18 +102,21 @@ class _Found:
 
     @classmethod
     def now(cls) -> Self:
-        # Dummy threads belong to libraries: Python cannot join them, and may report them as alive long after their end.
-        threads = {thread for thread in threading.enumerate() if not isinstance(thread, threading._DummyThread)}
-        return cls(threads, _child_processes(), _open_files())
+        return cls(_threads(), _child_processes(), _open_files())
+
+
+def _threads() -> set[threading.Thread]:
+    """Those of Python; libraries' own, which are dummies, cannot be joined, and may seem alive long after their end."""
+    return {thread for thread in threading.enumerate() if not isinstance(thread, threading._DummyThread)}
 
 
 def _open_files() -> dict[int, str]:
     """Descriptor -> its target; empty if the system does not provide it."""
     files: dict[int, str] = {}
-    directory = Path("/proc/self/fd")
-    for name in os.listdir(directory) if directory.exists() else ():
+    directory = "/proc/self/fd"
+    for name in os.listdir(directory) if os.path.exists(directory) else ():
         try:
-            target = os.readlink(directory / name)
+            target = os.readlink(f"{directory}/{name}")
         except FileNotFoundError:  # the one that listed the directory
             continue
         if not target.startswith(_SHARED):
@@ -124,10 +127,12 @@ def _open_files() -> dict[int, str]:
 def _child_processes() -> dict[int, str]:
     """Process id -> command line of every child, including zombies."""
     processes: dict[int, str] = {}
-    for children in Path("/proc/self/task").glob("*/children"):
+    tasks = "/proc/self/task"
+    for task in os.listdir(tasks) if os.path.exists(tasks) else ():
         pids: list[str] = []
-        with suppress(FileNotFoundError, ProcessLookupError):  # threads and processes end while this looks at them
-            pids = children.read_text().split()
+        # Threads and processes end while this looks at them.
+        with suppress(FileNotFoundError, ProcessLookupError), open(f"{tasks}/{task}/children") as children:
+            pids = children.read().split()
         for pid in pids:
             with suppress(FileNotFoundError, ProcessLookupError):
                 processes[int(pid)] = Path(f"/proc/{pid}/cmdline").read_text(errors="replace").replace("\0", " ")
