@@ -41,10 +41,9 @@ def test_one_episode_in_real_time(launch: Callable[..., Ran]):
 
 def test_the_whole_robot_with_its_cameras_in_lockstep(launch: Callable[..., Ran], rendering: None):
     kept = "recording={type: mcap, root: kept, dataset: pick}"  # without a receiver, they would render nothing
-    ran = launch("--lockstep", "--episodes", "1", "--set", kept, robot="so101")
+    ran = launch("--lockstep", "--duration", "1.5", "--set", kept, robot="so101")
     assert ran.code == 0, ran.err
     summary = ran.summary
-    assert summary["successes"] == 1
     assert summary["rates_hz"].keys() == {"top", "wrist"}
     assert all(rate == pytest.approx(30.0, rel=0.05) for rate in summary["rates_hz"].values())
 
@@ -76,7 +75,7 @@ def test_a_fault_is_named_and_the_run_holds_until_its_end(recorded: Callable[...
 
 
 def test_a_fault_in_real_time(launch: Callable[..., Ran]):
-    ran = launch("--duration", "6", "--set", "simulation.faults=[{at: 0.5, kind: silent}]")
+    ran = launch("--duration", "2", "--set", "simulation.faults=[{at: 0.5, kind: silent}]")
     assert ran.code == 1, ran.err
     (fault,) = ran.summary["faults"]
     assert "the joints do not answer: no state for " in fault
@@ -103,7 +102,7 @@ def test_a_wrong_command_line_is_exit_code_2(launch: Callable[..., Ran], argumen
 
 
 def test_a_component_that_cannot_start_is_exit_code_1(launch: Callable[..., Ran]):
-    ran = launch("--mode", "teleop")
+    ran = launch("--lockstep", "--mode", "teleop")
     assert ran.code == 1
     (line,) = [line for line in ran.err.splitlines() if line.startswith("error: ")]
     assert line.startswith("error: mode:teleop: ")

@@ -138,8 +138,8 @@ def test_a_person_jogs_by_keyboard_stops_and_leaves(terminal: Terminal, tmp_path
     terminal.until(lambda: abs(rows()[-1][1] - begun) > 0.3, keys="w")
     terminal.until(lambda: "EMERGENCY STOP" in terminal.shown, keys="\x1b")
     stopped = len(rows())
-    terminal.until(lambda: len(rows()) > stopped + 400, keys="w")
-    held = [row[1] for row in rows()[stopped + 300 :]]
+    terminal.until(lambda: len(rows()) > stopped + 150, keys="w")
+    held = [row[1] for row in rows()[stopped + 50 :]]
     assert max(held) - min(held) < 0.01, "no key moves it after an emergency stop"
 
     terminal.type("\x03")

@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("prompt_threads",
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 PATIENCE_S = 300.0
-MANY = 50
+MANY = 30
 """Messages of a phase of a run: longer than the greatest age."""
 STATES, COMMANDS = "/joint_states", "/arm/commands"
 OVERHEATING = 0x04

@@ -43,8 +43,8 @@ def picks(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def replay(ibrobot: tuple[str, ...], tmp_path: Path) -> Command:
-    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-        if "--lockstep" in arguments:
+    def run(*arguments: object, child: bool = False) -> subprocess.CompletedProcess[str]:
+        if not child:
             with chdir(tmp_path):
                 return run_here("replay", "--headless", *arguments)
         command = [*ibrobot, "replay", "--headless", *map(str, arguments)]
@@ -95,8 +95,10 @@ def test_joint_log_of_an_episode_is_replayed(replay: Command, tmp_path: Path):
     assert 1e-4 < max(each["max_rad"] for each in tracking.values()) < 0.15
 
 
-def test_in_real_time_at_another_speed_it_ends_and_tells_the_difference(replay: Command, picks: Path):
-    done = replay(picks / "episode_000001", "so101_blind", "--sim", "--speed", "2")
+def test_in_real_time_at_another_speed_it_ends_and_tells_the_difference(replay: Command, tmp_path: Path):
+    with chdir(tmp_path):
+        run_here("record", *BLIND, "--episodes", "1", "--set", "contract.max_duration_s=1")
+    done = replay("default:1", "so101_blind", "--sim", "--speed", "2", child=True)
     assert done.returncode in (0, 3), done.stderr
     lines = [line for line in done.stdout.splitlines() if line.startswith("tracking")]
     assert len(lines) == 6

@@ -13,7 +13,10 @@ pytestmark = pytest.mark.integration
 PROGRAM = Path(__file__).parents[2] / "benchmarks/stop_under_limits.py"
 
 
-@pytest.mark.parametrize("kind", ["memory", "threads", "files", "disk"])
+LONG = [pytest.param(kind, marks=pytest.mark.long) for kind in ("memory", "threads")]
+
+
+@pytest.mark.parametrize("kind", ["files", "disk", *LONG])
 def test_a_stop_is_answered_or_the_run_has_ended(kind: str) -> None:
     command = [sys.executable, str(PROGRAM), "--runs", "1", "--floor", "0", "--kind", kind]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
