@@ -1,11 +1,12 @@
 """Commands of `ibrobot` that die, as by kill -9, before their n-th change of files.
 
-Imported, `killing()` gives the function that runs them. Run as a program, it forks a child for each, which need not
-import anything again.
+Imported, `killing()` gives the function that runs them. Run as a program, it forks a child for each, and imports what
+one imported, so that the next ones need not.
 """
 
 from __future__ import annotations
 
+import importlib
 import json
 import mmap
 import os
@@ -13,11 +14,13 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import Any
+from contextlib import contextmanager, suppress
+from typing import Any, NoReturn
 
 NAMES = ("rename", "replace", "mkdir", "unlink", "rmdir", "symlink", "fsync", "ftruncate", "remove")
 KILLED = 9
+_ROOM = 1 << 20
+"""For the number of changes and the names of modules [bytes]."""
 
 
 @contextmanager
@@ -52,7 +55,7 @@ def _die_at(point: int, changes: mmap.mmap) -> None:
             count += 1
             changes[:4] = struct.pack("i", count)
             if count == point:
-                os._exit(KILLED)
+                _end(KILLED, changes)
             return call(*arguments, **more)
 
         return called
@@ -61,14 +64,25 @@ def _die_at(point: int, changes: mmap.mmap) -> None:
         setattr(os, name, dying(getattr(os, name)))
 
 
+def _end(code: int, changes: mmap.mmap) -> NoReturn:
+    """End the child; its parent reads what it imported."""
+    names = "\n".join(sys.modules).encode()
+    changes[4 : 4 + len(names)] = names
+    os._exit(code)
+
+
 def _run(point: int, command: Sequence[str]) -> tuple[int, int]:
     """Run a command in a child process; returns its exit code and how often it changed files."""
     from ibrobot_core.cli.main import main
 
-    changes = mmap.mmap(-1, 4)
+    changes = mmap.mmap(-1, _ROOM)
     child = os.fork()
     if child:
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        for name in changes[4:].rstrip(b"\0").decode().split("\n"):
+            if name not in sys.modules:
+                with suppress(ImportError):  # made by another one
+                    importlib.import_module(name)
         return code, struct.unpack("i", changes[:4])[0]
     os.dup2(2, 1)
     sys.argv = ["ibrobot", *command]
@@ -76,8 +90,8 @@ def _run(point: int, command: Sequence[str]) -> tuple[int, int]:
     try:
         main()
     except SystemExit as end:
-        os._exit(end.code if isinstance(end.code, int) else 0)
-    os._exit(0)
+        _end(end.code if isinstance(end.code, int) else 0, changes)
+    _end(0, changes)
 
 
 if __name__ == "__main__":
