@@ -88,7 +88,7 @@ def test_calibrated_teleoperated_recorded_and_replayed(
         "--headless",
         "--auto",
         "--duration",
-        "4",
+        "2",
         "--episodes",
         "1",
         *options,
