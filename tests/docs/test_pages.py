@@ -6,6 +6,7 @@ import re
 import shlex
 import textwrap
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -73,12 +74,18 @@ def _spans(page: Path) -> Iterator[Snippet]:
         yield Snippet(page, line, match[1].replace("\n", " "))
 
 
+@cache
+def _below(group: click.Group, word: str) -> click.Command | None:
+    """The command of a group; one that was made serves all lines that name it."""
+    return group.get_command(click.Context(group), word)
+
+
 def _command(arguments: list[str]) -> tuple[click.Command, click.Context, list[str]]:
     """The command that the words name, and the words after it."""
     command: click.Command = cli
     context = click.Context(cli)
     while isinstance(command, click.Group) and arguments and not arguments[0].startswith("-"):
-        found = command.get_command(context, arguments[0])
+        found = _below(command, arguments[0])
         if found is None and command.invoke_without_command:
             break
         assert found is not None, f"no command {arguments[0]!r}"
