@@ -22,6 +22,8 @@ from ibrobot_planning.planners.timing import LONGEST_S
 from ibrobot_planning.suite import FakePlanner
 
 from ibrobot_core.api import (
+    FollowTrajectory,
+    HardwareError,
     Header,
     Joint,
     JointTrajectory,
@@ -270,3 +272,34 @@ def test_nothing_is_proved_of_an_incomplete_trajectory(run):
     """A trajectory whose course is unknown is blocked, so that nothing runs unwatched."""
     touched = door_of(run().session).blocked(trajectory((0, LEFT), (1, LEFT)))
     assert "without velocities and accelerations" in touched
+
+
+@pytest.mark.parametrize("by_control", [False, True])
+def test_refused_trajectory_ends_no_motion_of_another_client(
+    start: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by_control: bool
+):
+    """The other motion begins with a pause, so that the robot is at rest."""
+    text = robot_yaml(tmp_path).replace("{arm: [pan, lift", "{turn: [pan], arm: [lift")
+    text = text.replace("executors:\n", "executors:\n  turn: {type: trajectory, group: turn}\n", 1)
+    runtime = start(text=text.replace("[arm, gripper]", "[turn, arm, gripper]") + "world: {}\n")
+    session, states = runtime.session, []
+    runtime.step()
+    session.on_goal.append(lambda event: states.append(event["state"]) if event["goal"] == "theirs" else None)
+    pausing = trajectory((2, [0.0]), (4, [0.5]), names=("pan",))
+    session.send_goal("turn", "theirs", FollowTrajectory(pausing))
+    call = session.control.call
+
+    def refused(command: Any) -> Any:
+        if by_control and type(command).__name__ == "SendGoal":
+            raise HardwareError("refused")
+        return call(command)
+
+    monkeypatch.setattr(session.control, "call", refused)
+    if not by_control:
+        session.bus.call("/world/add", {"name": "wall", "object": WALL_BOX})
+    result = follow(runtime, trajectory((4, LEFT[1:]), names=ARM[1:]))
+    assert result.code is (PlanCode.CONTROL_FAILED if by_control else PlanCode.INVALID_MOTION_PLAN)
+    for _ in range(450):
+        runtime.step()
+    assert states == ["executing", "succeeded"]
+    assert command(runtime)[0] == pytest.approx(0.5)

@@ -159,6 +159,20 @@ def test_equal_seeds_give_equal_blends(run):
     np.testing.assert_array_equal(ride(), ride())
 
 
+def test_obstacle_stops_a_motion_whose_goal_has_ended(run):
+    """For example while the mode is switched."""
+    runtime = run()
+    number = runtime.session.bus.call(GO_TO, "left")
+    step(runtime, 15)
+    runtime.session.end_source()
+    box = {"shape": "box", "size": [0.2, 0.02, 0.3], "position": [0.09, 0.13, 0.2], "rpy": [0, 0, 1.0]}
+    runtime.session.bus.call("/world/add", {"name": "crate", "object": box})
+    step(runtime, 100)
+    assert clearance(runtime) > 0
+    runtime.session.begin_source()
+    assert runtime.session.bus.call(RESULT, number).outcome == "CANCELLED"
+
+
 @pytest.mark.parametrize("mode", ["plan", "joint"])
 def test_obstacle_that_appears_stops_the_arm_before_it(run, mode: str):
     """Also a motion of a planner that knows no obstacles."""

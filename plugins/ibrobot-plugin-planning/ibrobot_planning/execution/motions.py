@@ -88,7 +88,7 @@ class Execution:
             stops: number of emergency stops when it was requested; control refuses it after a newer one.
 
         Raises:
-            HardwareError: if an executor refuses its goal; the others are cancelled.
+            HardwareError: if an executor refuses its goal; those that were sent before are cancelled.
             PlanningError: the same, if a trajectory fails a check.
         """
         with self._lock:
@@ -97,7 +97,8 @@ class Execution:
                 for name, goal in goals.items():
                     self._send(name, f"{number}:{name}", goal)
             except (HardwareError, PlanningError):
-                self._session.cancel_goals()
+                for name in self._tracks:
+                    self._session.cancel_goals(name)
                 self._tracks = {}
                 raise
 

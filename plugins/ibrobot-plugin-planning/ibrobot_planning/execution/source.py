@@ -477,12 +477,14 @@ class PlannerSource(SourceWorker):
             self._execution.stop(move.number)
 
     def _stop_before(self, goal_id: str, touched: str, code: PlanCode) -> bool:
-        """Stop the move under way before what has come into its way; False if the goal is not of this source."""
+        """Stop the move under way before what has come into its way; False if the goal is not of such a move."""
         if not self._execution.follows(goal_id):
             return False
         with self._choosing:
             move = self._move
-            if move is not None and not move.dropped and not move.blocked:
+            if move is None:  # e.g. its mode ends: its goals may still go on for a moment
+                return False
+            if not move.dropped and not move.blocked:
                 move.blocked, move.blocked_code = touched, code
                 self._execution.stop(move.number)
         return True
@@ -504,6 +506,7 @@ class PlannerSource(SourceWorker):
         self._show("executing")
         try:
             goals, move.planned = self._plans.plan(move.target, commanded(self.session), era=move.era)
+            self._execution.check(goals)  # before any of them is sent
             with self._choosing:
                 self._move = move
             self._execution.begin(move.number, goals, move.stops)
