@@ -29,7 +29,7 @@ from typing import Any
 
 import httpx2
 import numpy as np
-from figures import report
+from apparatus import CONFIGS, report
 from ibrobot_mcp.door import AgentDoor
 from ibrobot_mcp.tokens import add_token
 from mcp import Client, MCPError
@@ -37,7 +37,7 @@ from mcp.client.streamable_http import streamable_http_client
 
 from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
 
-CONFIG = Path(__file__).parents[1] / "configs" / "so101_blind.yaml"
+CONFIG = CONFIGS / "so101_blind.yaml"
 OPEN = 8
 STILL_RAD = 1e-6
 LATEST_STOP_MS = 100.0

@@ -24,7 +24,7 @@ import attrs
 import cv2
 import mujoco
 import numpy as np
-from figures import report
+from apparatus import report
 from ibrobot_camera.intrinsics.board import Board
 from ibrobot_camera.intrinsics.views import View, find
 from ibrobot_camera.mounting.fit import Session

@@ -28,30 +28,24 @@ from typing import Any
 import can
 import numpy as np
 import yaml
-from figures import report
+from apparatus import ROOT, in_rounds, report, started
 from ibrobot_damiao.bus import Channel, DamiaoBus
 from ibrobot_damiao.emulator.serve import line_of
 from ibrobot_damiao.protocol import REGISTER_ID, refresh
 from ibrobot_testing import ibrobot_command
-from progress import in_rounds
 
 MOTORS = range(1, 9)
 LIMIT = 1.25
 PRIORITY = 60
 """Real-time priority of the reads, below that of the emulator."""
-PAGE = Path(__file__).parents[1] / "docs/how-to/drive-a-can-arm.md"
+PAGE = ROOT / "docs/how-to/drive-a-can-arm.md"
 _ANSWER_BYTES = len(line_of((0, bytes(8))))
 
 
 def emulator(stack: ExitStack) -> str:
     """The channel of emulated motors in a process of their own."""
-    command = [*ibrobot_command(), "damiao", "emulate", "--motors", str(len(MOTORS))]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    stack.callback(process.stdout.close)
-    stack.callback(process.wait)
-    stack.callback(process.terminate)
-    return process.stdout.readline().strip()
+    command = [*ibrobot_command()[1:], "damiao", "emulate", "--motors", len(MOTORS)]
+    return stack.enter_context(started(*command))[1]
 
 
 def bare(channel: str, stack: ExitStack) -> Callable[[], None]:

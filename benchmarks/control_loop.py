@@ -17,27 +17,20 @@ import asyncio
 import contextlib
 import json
 import statistics
-import subprocess
 import sys
 import threading
-from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests/shared"))
-from figures import report
+from apparatus import CONFIGS, ended, in_a_process, report, running
 from page_run import client, page_run
 
+from ibrobot_core.app import load_config
 from ibrobot_core.clock import RealClock
-from ibrobot_core.config import load_config
 from ibrobot_core.control.realtime import go_real_time
 from ibrobot_core.control.timing import Punctuality
-from ibrobot_core.interfaces.run import LaunchRequest
-from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import Session
-from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.units import ns
 
-CONFIG = Path(__file__).parents[1] / "configs" / "so101.yaml"
+CONFIG = CONFIGS / "so101.yaml"
 ALLOWED_RATIO = 2.0
 LOOPS = {
     "bare": "a bare loop",
@@ -67,20 +60,13 @@ def bare(seconds: float, period_ns: int, priority: int) -> dict[str, Any]:
 
 def system(seconds: float, *, busy: bool) -> dict[str, Any]:
     """A run as `ibrobot launch` makes it."""
-    runtime = Runtime(Session(load_config(CONFIG, sim=True), installed_plugins(), LaunchRequest(duration_s=seconds)))
     end = threading.Event()
     thread = threading.Thread(target=_count, args=(end,), daemon=True)
-    runtime.start()
-    try:
+    with running(load_config(CONFIG, sim=True), duration_s=seconds) as runtime:
         if busy:
             thread.start()
-        while not runtime.wait(0.2):
-            pass
-        summary = runtime.summary()
-    finally:
+        summary = ended(runtime)
         end.set()
-        runtime.stop()
-    runtime.raise_failure()
     return summary | {"refused": runtime.session.control.refused}
 
 
@@ -99,20 +85,12 @@ async def beside_pages(seconds: float) -> dict[str, Any]:
             return {"loop": pages[0].status["counts"]["loop"], "refused": []}
 
 
-def measure(loop: str, seconds: float) -> dict[str, Any]:
-    """One measurement, in a process of its own."""
-    command = [sys.executable, __file__, "--only", loop, "--seconds", str(seconds)]
-    ran = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-    result: dict[str, Any] = json.loads(ran.stdout.splitlines()[-1])
-    return result
-
-
 def compare(repetitions: int, seconds: float) -> int:
     """Measure all loops in turn, print what was found, and return the exit status."""
     found: dict[str, list[dict[str, Any]]] = {loop: [] for loop in LOOPS}
     for repetition in range(1, repetitions + 1):
         for loop, name in LOOPS.items():
-            result = measure(loop, seconds)
+            result = in_a_process(__file__, "--only", loop, "--seconds", seconds)
             found[loop].append(result)
             figures = result["loop"]
             rates = "".join(f", {camera} {rate:.1f} Hz" for camera, rate in result.get("rates_hz", {}).items())

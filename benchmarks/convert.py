@@ -41,7 +41,7 @@ from typing import Any
 from uuid import UUID
 
 import numpy as np
-from figures import report
+from apparatus import report
 
 HEIGHT, WIDTH, FPS = 480, 640, 30
 CAMERAS = ("top", "wrist")

@@ -20,9 +20,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from figures import report
+from apparatus import report
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "shared"))
 FIRST_SEED = 70_000
 CONSEQUENCES = {
     "idle_start": {"odd_length"}, "idle_end": {"odd_length"}, "stall": {"odd_length"},

@@ -21,7 +21,6 @@ import argparse
 import json
 import multiprocessing
 import shutil
-import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -33,11 +32,11 @@ from unittest.mock import patch
 
 import attrs
 import numpy as np
+from apparatus import CONFIGS, ibrobot, report
 from explain_faults import BLIND, DIFFUSED, EARLY, FAULTS, Fault
-from figures import report
 from safetensors.numpy import load_file, save_file
 
-CONFIG = Path(__file__).parents[1] / "configs" / "so101_pick_cube.yaml"
+CONFIG = CONFIGS / "so101_pick_cube.yaml"
 DEMOS, TUNED, REPORTED = 1000, 3000, 5000
 """First seeds of the demonstrations, of the runs on which thresholds may be chosen, and of those that count."""
 STRENGTHS = ("mild", "medium", "strong")
@@ -69,14 +68,6 @@ def robot(velocity: str = "3.0", *, sees: bool = True) -> str:
     )
 
 
-def command(*words: str | Path) -> None:
-    """Run a command of this environment."""
-    print(f"$ {' '.join(map(str, words))}", file=sys.stderr)
-    done = subprocess.run([Path(sys.executable).with_name("ibrobot"), *words], stdout=subprocess.DEVNULL, check=False)
-    if done.returncode not in (0, 3):
-        raise SystemExit(f"{words[0]} ended with {done.returncode}")
-
-
 def prepare(work: Path, episodes: int, policies: Sequence[str]) -> None:
     """Demonstrations, datasets and policies, where they are not there yet."""
     work.mkdir(parents=True, exist_ok=True)
@@ -84,9 +75,9 @@ def prepare(work: Path, episodes: int, policies: Sequence[str]) -> None:
     cube.write_text(robot(), encoding="utf-8")
     demos = work / "episodes"
     if not demos.exists():
-        command(
+        ibrobot(
             "record", cube, "--sim", "--lockstep", "--headless", "--episodes", str(episodes), "--seed", str(DEMOS),
-            "--root", demos, "--dataset", "pick", "--prompt", PROMPT,
+            "--root", demos, "--dataset", "pick", "--prompt", PROMPT, good=(0, 3),
         )  # fmt: skip
     listed = sorted(demos.glob("pick/episodes/episode_*"))
     small = ("--policy.down_dims=[64,128]", "--policy.horizon=32", "--policy.n_action_steps=24",
@@ -95,9 +86,9 @@ def prepare(work: Path, episodes: int, policies: Sequence[str]) -> None:
     least = ("--policy.dim_model=256", "--policy.dim_feedforward=512", "--policy.pretrained_backbone_weights=null")
     state, pictures = work / "dataset-state", work / "dataset-pictures"
     if not state.exists():
-        command("convert", *listed, "--out", state, "--config", CONFIG, "--force-contract")
+        ibrobot("convert", *listed, "--out", state, "--config", CONFIG, "--force-contract")
     if not pictures.exists():
-        command("convert", *listed[: len(listed) // 2], "--out", pictures, "--codec", "h264")
+        ibrobot("convert", *listed[: len(listed) // 2], "--out", pictures, "--codec", "h264")
     for name, dataset, words in (
         ("state", state, ("--steps", "900", *least, "--policy.optimizer_lr=1e-4")),
         *((f"early-{steps}", state, ("--steps", str(steps), *least)) for steps in EARLY),
@@ -105,12 +96,12 @@ def prepare(work: Path, episodes: int, policies: Sequence[str]) -> None:
         ("pictures", pictures, ("--steps", "300", "--batch-size", "8", *least)),
     ):
         if name in policies and not (work / name / "checkpoints/last").exists():
-            command("train", dataset, "--out", work / name, "--device", "cpu", *words)
+            ibrobot("train", dataset, "--out", work / name, "--device", "cpu", *words)
     for times, name in zip(BLIND, BLIND_ONES, strict=True):
         if name in policies and "pictures" in policies and not (work / name).exists():
             blind(work / "pictures/checkpoints/last/pretrained_model", work / name, times)
     if not (work / "reference.json").exists():
-        command("datasets", "card", demos, "--out", work / "reference.json")
+        ibrobot("datasets", "card", demos, "--out", work / "reference.json")
 
 
 def blind(checkpoint: Path, out: Path, times: int) -> None:
@@ -148,11 +139,8 @@ class Trial:
 
     def folder(self, work: Path) -> Path:
         """Where its recording is kept."""
-        return (
-            work
-            / "runs"
-            / "-".join(filter(None, (self.cause or "healthy", self.strength, self.policy, str(self.seed))))
-        )
+        parts = (self.cause or "healthy", self.strength, self.policy, str(self.seed))
+        return work / "runs" / "-".join(filter(None, parts))
 
 
 def act(work: Path, trial: Trial) -> None:
@@ -263,16 +251,8 @@ def main() -> int:
         right = result.get("first") == trial.cause
         why = "" if right else f" {result.get('all', '')} {result.get('text', result.get('error'))}"
         said = result.get("first", "error")
-        print(
-            trial.cause or "healthy",
-            trial.strength,
-            trial.policy,
-            trial.seed,
-            said or "-",
-            why,
-            file=sys.stderr,
-            flush=True,
-        )
+        named = (trial.cause or "healthy", trial.strength, trial.policy, trial.seed)
+        print(*named, said or "-", why, file=sys.stderr, flush=True)
     return show(results)
 
 

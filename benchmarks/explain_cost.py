@@ -20,9 +20,8 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from figures import report
+from apparatus import report
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "shared"))
 MOST_MB = 300
 """Most memory of a process that explains [MB]."""
 LARGER = 7

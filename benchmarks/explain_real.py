@@ -25,7 +25,7 @@ from unittest.mock import patch
 
 import attrs
 import numpy as np
-from figures import report
+from apparatus import report
 from ibrobot_diagnose import window
 from ibrobot_diagnose.card import Maker
 from ibrobot_diagnose.cause import Reference

@@ -15,7 +15,6 @@ import argparse
 import importlib.util
 import json
 import os
-import subprocess
 import sys
 import termios
 import time
@@ -25,13 +24,12 @@ from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
-from figures import report
+from apparatus import in_rounds, report, started
 from ibrobot_feetech import protocol
 from ibrobot_feetech.bus import FeetechBus
 from ibrobot_feetech.protocol import Packet
 from ibrobot_feetech.registers import STS3215
 from ibrobot_feetech.sync import SyncReader, SyncWriter
-from progress import in_rounds
 
 SERVOS = range(1, 7)
 GOALS = [2048] * len(SERVOS)
@@ -169,7 +167,8 @@ def measure(throttled: bool, rounds: int, calls: int) -> dict[str, Any]:
     times: dict[tuple[str, str], list[float]] = {}
     cpu: dict[tuple[str, str], list[float]] = {}
     with ExitStack() as stack:
-        clients = {name: make(_servos(throttled, stack), stack) for name, make in available().items()}
+        servos = [__file__, "--serve", *(["--throttled"] if throttled else [])]
+        clients = {name: make(stack.enter_context(started(*servos))[1], stack) for name, make in available().items()}
         for number in in_rounds(rounds + 1):
             for name, (read, write) in clients.items():
                 for what in ("read", "read+write"):
@@ -194,15 +193,6 @@ def measure(throttled: bool, rounds: int, calls: int) -> dict[str, Any]:
             "ratio": round(float(p50) / floor, 2),
         }
     return result
-
-
-def _servos(throttled: bool, stack: ExitStack) -> str:
-    arguments = [sys.executable, __file__, "--serve", *(["--throttled"] if throttled else [])]
-    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    stack.callback(process.wait)
-    stack.callback(process.terminate)
-    return process.stdout.readline().strip()
 
 
 def main() -> int:

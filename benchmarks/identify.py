@@ -19,7 +19,8 @@ from time import process_time
 
 import attrs
 import numpy as np
-from figures import report
+from apparatus import report
+from arm_moves import TICK_NS, moves
 from ibrobot_mujoco.hardware import MujocoHardware
 from ibrobot_mujoco.identification.fit import ARM, KINDS, SHARED
 from ibrobot_mujoco.identification.identify import Result, identify
@@ -31,9 +32,6 @@ from ibrobot_mujoco.so101 import so101
 from ibrobot_testing import control_context
 
 from ibrobot_core.api import EpisodeSetup, Vector, resolve_path
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests/shared"))
-from arm_moves import TICK_NS, moves
 
 ROBOT = so101()
 ENCODER_RAD = 2 * np.pi / 4096

@@ -23,7 +23,6 @@ import argparse
 import json
 import logging
 import math
-import os
 import socket
 import ssl
 import struct
@@ -31,24 +30,22 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from figures import report
+from apparatus import cpu_s, ibrobot, in_rounds, plugin, report, started, transport
 from ibrobot_serve.process import ProcessEngine
 from ibrobot_serve.remote import RemoteEngine
 from ibrobot_serve.service import InferenceService
 from ibrobot_serve.wire import WireKind, WireMessage, encode
 from ibrobot_testing import host_context
 from ibrobot_testing.ports import free_port
-from made_up import plugin
-from progress import in_rounds
 
 from ibrobot_core.config import load_config
 from ibrobot_core.inference.client import DispatchInfer, EngineClient
-from ibrobot_core.interfaces import Engine, Frame, Transport
+from ibrobot_core.interfaces import Engine, Frame
 from ibrobot_core.plugins import installed_plugins
 
 PLUGIN = '''
@@ -100,12 +97,6 @@ LIMITS = {"process": ("tcp", 3.0), "zenoh": ("tcp", 5.0), "zenoh shm": ("tcp", 5
 """How often a floor's time raw cameras may take."""
 
 
-def cpu_s(pid: int | str) -> float:
-    """Processor time of a process so far [s]."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
 def measure(ask: Callable[[int], float], other: int, count: int, pause_s: float) -> dict[str, Any]:
     """Ask again and again; `ask` returns how long it was blocked [s], and `other` is the process that answers."""
     latencies, blocked = [], []
@@ -139,22 +130,6 @@ def asking(client: EngineClient, pictures: np.ndarray) -> Callable[[int], float]
         return blocked_s
 
     return ask
-
-
-@contextmanager
-def started(*arguments: str) -> Iterator[int]:
-    """This file in a process of its own, ready; its process id."""
-    process = subprocess.Popen([sys.executable, __file__, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    assert process.stdin is not None
-    assert process.stdout is not None
-    try:
-        if process.stdout.readline() != b"ready\n":
-            raise SystemExit(f"{arguments} did not start")
-        yield process.pid
-    finally:
-        process.stdin.close()
-        process.wait()
-        process.stdout.close()
 
 
 def security_options(certificates: Path | None) -> tuple[str, ...]:
@@ -207,7 +182,7 @@ def floor(pictures: np.ndarray, count: int, pause_s: float, certificates: Path |
     frame = bytes(encode(WireMessage(WireKind.REQUEST, 1, tensors)))
     buffer = memoryview(bytearray(1 << 20))
     port = free_port()
-    with started("--echo", str(port), *security_options(certificates)) as pid:
+    with started(__file__, "--echo", port, *security_options(certificates)) as (process, _):
         plain = socket.create_connection(("127.0.0.1", port))
         plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         with secured(plain, certificates, "robot") as connection:
@@ -218,14 +193,7 @@ def floor(pictures: np.ndarray, count: int, pause_s: float, certificates: Path |
                 receive(connection, buffer)
                 return 0.0
 
-            return measure(ask, pid, count, pause_s)
-
-
-def transport(**options: Any) -> Transport:
-    """One of type zenoh."""
-    descriptor = installed_plugins().find("transport", "zenoh")
-    made: Transport = descriptor.make(descriptor.options(**options), host_context())
-    return made
+            return measure(ask, process.pid, count, pause_s)
 
 
 def tls(folder: Path | None, machine: str) -> dict[str, Any]:
@@ -269,11 +237,11 @@ def over_zenoh(
 ) -> dict[str, Any]:
     """Execution mode distributed."""
     endpoint = f"{'tls/localhost' if certificates else 'tcp/127.0.0.1'}:{free_port()}"
-    with started("--serve", endpoint, *security_options(certificates)) as pid:
+    with started(__file__, "--serve", endpoint, *security_options(certificates)) as (process, _):
         network = transport(connect=(endpoint,), shared_memory=shared, **tls(certificates, "robot"))
         try:
             null = installed_plugins().find("policy", "null").make(None, host_context())
-            return through(RemoteEngine(null, network, "null", "robot"), lambda: pid, pictures, count, pause_s)
+            return through(RemoteEngine(null, network, "null", "robot"), lambda: process.pid, pictures, count, pause_s)
         finally:
             network.close()
 
@@ -320,9 +288,7 @@ def measured(
 def run(given: argparse.Namespace, folder: Path) -> int:
     """Print the table; 1 when a limit is missed."""
     certificates = folder / "certificates"
-    ibrobot = (sys.executable, "-c", "from ibrobot_core.cli.main import main; main()")
-    made = ("certs", certificates, "--server", "localhost", "--robot", "robot")
-    subprocess.run([*ibrobot, *made], check=True, stdout=subprocess.DEVNULL)
+    ibrobot("certs", certificates, "--server", "localhost", "--robot", "robot")
     found: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for number in in_rounds(ROUNDS):
         for payload, way, row in measured(given, number, folder, certificates):

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from figures import report
+from apparatus import report
 from ibrobot_kinematics import KinematicModel, Target, UnreachableError, read_mjcf, robot_model, solve
 from ibrobot_kinematics.model import TipPose
 from ibrobot_kinematics.search import search

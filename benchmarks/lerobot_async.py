@@ -17,7 +17,6 @@ import argparse
 import json
 import logging
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -25,13 +24,12 @@ from collections.abc import Iterator
 from concurrent import futures
 from contextlib import ExitStack, closing, contextmanager
 from importlib.util import find_spec
-from pathlib import Path
 from queue import Queue
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from figures import report
+from apparatus import cpu_s, report, started
 
 PAYLOADS = {
     "2x640x480 uint8": ((480, 640, 3), np.uint8),
@@ -118,28 +116,13 @@ def serve(port: int, payload: str, way: str) -> None:
     server.stop(None)
 
 
-def cpu_s(pid: int | str = "self") -> float:
-    """Processor time of a process so far [s]."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / 100
-
-
 @contextmanager
 def served(payload: str, way: str) -> Iterator[tuple[str, int]]:
     """A server in another process: its address and process."""
     with closing(socket.create_server(("127.0.0.1", 0))) as free:
         port = int(free.getsockname()[1])
-    command = [sys.executable, __file__, "--serve", str(port), "--payload", payload, "--way", way]
-    server = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    assert server.stdout is not None
-    try:
-        while "ready" not in (line := server.stdout.readline()):
-            if not line:
-                raise SystemExit("the server did not start")
+    with started(__file__, "--serve", port, "--payload", payload, "--way", way, says="ready") as (server, _):
         yield f"127.0.0.1:{port}", server.pid
-    finally:
-        server.kill()
-        server.communicate()
 
 
 class Theirs:

@@ -1,7 +1,6 @@
 """Fifty dispatchers on three servers of one model: one server is killed, one drained for an update, one a canary.
 
     python benchmarks/moving_fleet.py [--robots 50] [--seconds 10]
-    python benchmarks/moving_fleet.py --faults [--robots 12] [--seconds 30]
 
 Three `ibrobot serve` with a model of 20 ms a request, over Zenoh on this machine, with `lease=0.7`. Each robot is a
 dispatcher with chunks of 50 actions at 30 Hz along a sine, ten robots a process, an episode every 8 s. After
@@ -12,12 +11,6 @@ Prints for each phase p50 and p99 of the latency [ms], holds (plans that ran out
 server; for each event, how many robots the server had, and the seconds until the last of them had the answer to what it
 asked, or had asked when its server went. Exits with 1 when that is more than a second, when setpoints moved faster
 than their joint may, an answer was to another request, no robot tried the canary, or the drained server failed.
-
-With `--faults` there are four servers and twelve robots: a server whose model works, one whose model raises at every
-request, one that takes 500 ms, and a canary for 30 % whose model raises. Prints for each robot its largest number of
-failed requests in a row, and for each server its requests, errors, latency, state and robots. Exits with 1 when a robot
-had more than two failures in a row, a faulty server got no robot, or a robot is at the slow server or a faulty canary
-at the end; robots may try the ordinary server that raises again, which the working one then answers for.
 """
 
 from __future__ import annotations
@@ -30,62 +23,57 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
-from itertools import groupby
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, override
 
 import attrs
 import numpy as np
-from figures import report
-from fleet_robot import RATE_HZ, Robot, transport
-from ibrobot_serve.wire import health_name
-from ibrobot_testing import host_context
+from apparatus import plugin, report, started, transport
+from ibrobot_serve.remote import RemoteEngine
+from ibrobot_testing import host_context, ibrobot_command, make_robot
 from ibrobot_testing.fakes import FakePolicy
 from ibrobot_testing.ports import free_port
-from made_up import plugin
+from stepped_fleet import CHUNK, RATE_HZ, REQUEST_TIMEOUT_S, fleet_contract
 
-from ibrobot_core.inference.client import Chunk
+from ibrobot_core.bus import Bus
+from ibrobot_core.clock import RealClock
+from ibrobot_core.dispatch.dispatcher import Dispatcher
+from ibrobot_core.inference.client import EngineClient
 from ibrobot_core.interfaces import Frame, Tensors, Transport
+from ibrobot_core.messages import Header, JointState
 from ibrobot_core.robot import Vector
+from ibrobot_core.schema import DispatchConfig
 
-CHUNK = 50
 A_PROCESS = 10
 """Robots."""
 EPISODE_S, LEASE_S, AGAIN_S = 8.0, 0.7, 1.0
-FAULTS = {"works": "", "raises": "raises", "slow": "slow", "canary": "raises"}
-"""What is wrong with the models of `--faults`."""
-CANARY_SHARE, MOST_FAILURES = 30, 2
-REPLACED = "replaced by the newer request"
 PLUGIN = """
 import time
 from pathlib import Path
 import attrs
 import numpy as np
 from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import PolicyDescriptor
+from ibrobot_core.descriptors import Options, PolicyDescriptor
 from ibrobot_core.options import option
 from ibrobot_testing import host_context
 from ibrobot_testing.fakes import FakePolicy
 
 @attrs.frozen
 class GivenOptions(Options):
-    path: Path = option(help="a folder with the files `weights` and `fault`")
+    path: Path = option(help="a folder with the file `weights`")
 
 class Sine(FakePolicy):
     def __init__(self, options, ctx):
         super().__init__(host_context())
         self.spec = attrs.evolve(self.spec, chunk_size=50)
         self._weights = (options.path / "weights").read_text()
-        self._fault = (options.path / "fault").read_text()
     def load(self):
         pass
     def weights(self):
         return self._weights
     def infer(self, tensors):
-        time.sleep(0.5 if self._fault == "slow" else 0.02)
-        if self._fault == "raises":
-            raise RuntimeError("CUDA error: device-side assert triggered")
+        time.sleep(0.02)
         at = 0.4 * np.sin(tensors["phase"])
         return {"actions": np.repeat(at[:, None], 6, axis=1), "echo": tensors["number"]}
 
@@ -121,44 +109,71 @@ class Sine(FakePolicy):
         return np.asarray(tensors["actions"], np.float64)
 
 
-class MovingRobot(Robot):
-    """A dispatcher whose steps and servers are written down; an episode every 8 s."""
+class Robot:
+    """A dispatcher on its ticks, in a thread; an episode every 8 s, and its steps and servers are written down."""
 
     def __init__(self, number: int, network: Transport) -> None:
-        super().__init__(number, network, "auto", Sine(), self._take)
+        robot = make_robot()
+        self.policy = Sine()
+        self.engine = RemoteEngine(self.policy, network, "model", f"robot{number}", start_timeout_s=60.0)
         # Names without chance: robots draw by them whether they try a canary.
         self.engine._robot = self.engine._choice.robot = f"robot{number}"
+        self._clock, self._joints = RealClock(), robot.joint_names
+        self._limits = np.array([joint.max_velocity for joint in robot.joints])
+        self._bus = Bus(self._clock)
+        self._client = EngineClient(self.policy, self.engine, REQUEST_TIMEOUT_S)
+        contract = fleet_contract()
+        self._step_ns = contract.step_ns
+        self._dispatcher = Dispatcher(
+            contract, self.policy.spec, DispatchConfig("auto"), robot, self._bus, self._client, self._take,
+            REQUEST_TIMEOUT_S,
+        )  # fmt: skip
         self._plan: tuple[int, int, Vector] | None = None
         self._last: tuple[int, Vector] | None = None
         """The last setpoint and its time [ns]; None while the arm holds."""
         self._episode_s = time.monotonic() + EPISODE_S * (1 + number % A_PROCESS / A_PROCESS)
+        self.until_s = float("inf")
+        self.chunks: list[tuple[float, float]] = []
+        """When each came [s], and its latency [ms]."""
+        self.holds: list[float] = []
+        """When the plan ran dry [s]."""
         self.worst = 0.0
         """Greatest speed of a joint between setpoints, as a share of its limit, unless the arm held in between."""
         self.servers: list[tuple[float, str]] = []
         """When the robot came to which server [s]."""
-        self.failures: list[bool] = []
-        """Whether each request failed, but for those in whose place the robot itself sent a newer one."""
-        self.replaced = 0
 
-    @override
-    def after_chunk(self, chunk: Chunk) -> None:
-        if REPLACED in chunk.error:
-            self.replaced += 1
-        else:
-            self.failures.append(chunk.actions is None)
+    def run(self) -> None:
+        """Go on until `until_s`."""
+        self._dispatcher.begin(0)
+        next_ns, stats = self._clock.now_ns(), self._dispatcher.stats
+        while time.monotonic() < self.until_s:
+            chunk = self._client.poll(max(0.0, (next_ns - self._clock.now_ns()) / 1e9))
+            if chunk is not None:
+                before = stats.chunks
+                self._dispatcher.accept(chunk, self._clock.now_ns())
+                if stats.chunks > before:
+                    self.chunks.append((time.monotonic(), stats.latency_ms))
+            if (now_ns := self._clock.now_ns()) >= next_ns:
+                holds, state = stats.holds, JointState(Header(now_ns), self._joints, np.zeros(len(self._joints)))
+                self._bus.publish("/joint_states", state)
+                self._dispatcher.tick(now_ns)
+                self.holds += [time.monotonic()] * (stats.holds - holds)
+                self._note(now_ns)
+                next_ns += self._step_ns
+        self._client.close()
+        self.engine.close()
 
     def _take(self, start_ns: int, step_ns: int, positions: Vector) -> None:
         self._plan = (start_ns, step_ns, positions)
 
-    @override
-    def after_tick(self, now_ns: int) -> None:
+    def _note(self, now_ns: int) -> None:
         server = self.engine._last_server
         if not self.servers or self.servers[-1][1] != server:
             self.servers.append((time.monotonic(), server))
         if time.monotonic() > self._episode_s:
             self._episode_s += EPISODE_S
             self._plan = None
-            self.dispatcher.begin(int(self._episode_s))
+            self._dispatcher.begin(int(self._episode_s))
         last, self._last = self._last, None
         if self._plan is None:
             return
@@ -169,34 +184,24 @@ class MovingRobot(Robot):
         at_ns, at = start_ns + step * step_ns, positions[step]
         self._last = (at_ns, at)
         if last is not None:  # a tick may come late, and the setpoint is then that of a later time
-            most = np.array([joint.max_velocity for joint in self.robot.joints]) * max(step_ns, at_ns - last[0]) / 1e9
+            most = self._limits * max(step_ns, at_ns - last[0]) / 1e9
             self.worst = max(self.worst, float((np.abs(at - last[1]) / most).max()))
 
     def report(self) -> dict[str, Any]:
         """All that was counted, as JSON values."""
-        assert isinstance(self.policy, Sine)
-        return {
-            "chunks": self.chunks,
-            "holds": self.holds,
-            "worst": self.worst,
-            "servers": self.servers,
-            "wrong": self.policy.wrong,
-            "failures": self.engine.stats.failures,
-            "requests": len(self.failures),
-            "replaced": self.replaced,
-            "failed": sum(self.failures),
-            "in_a_row": max((len(list(row)) for failed, row in groupby(self.failures) if failed), default=0),
-        }
+        names = ("chunks", "holds", "worst", "servers")
+        counted = {name: getattr(self, name) for name in names}
+        return {**counted, "wrong": self.policy.wrong, "failures": self.engine.stats.failures}
 
 
 def robots(endpoints: list[str], first: int, count: int) -> None:
     """Some robots, until a line comes; what they counted is the last line."""
     network = transport(mode="peer", connect=tuple(endpoints))
-    fleet = [MovingRobot(first + i, network) for i in range(count)]
+    fleet = [Robot(first + i, network) for i in range(count)]
     for robot in fleet:
-        robot.start()
+        robot.engine.start()
     print("ready", flush=True)
-    threads = [threading.Thread(target=robot.run, args=(float("inf"),)) for robot in fleet]
+    threads = [threading.Thread(target=robot.run) for robot in fleet]
     for thread in threads:
         thread.start()
     sys.stdin.readline()
@@ -212,8 +217,8 @@ class Server:
     """`ibrobot serve` in a process of its own."""
 
     def __init__(self, model: Path, endpoint: str, *options: str) -> None:
-        command = [sys.executable, "-c", "from ibrobot_core.cli.main import main; main()", "serve", str(model)]
-        command += ["--type", "sine", "--name", "model", "--listen", endpoint, "--transport", f"lease={LEASE_S}"]
+        command = [*ibrobot_command(), "serve", str(model), "--type", "sine", "--name", "model", "--listen", endpoint]
+        command += ["--transport", f"lease={LEASE_S}"]
         self._process = subprocess.Popen(
             [*command, *options, "--batch", "1"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
@@ -237,24 +242,12 @@ class Server:
         return self._process.returncode
 
 
-def folder(root: Path, name: str, weights: str, fault: str = "") -> Path:
+def folder(root: Path, weights: str) -> Path:
     """A model."""
-    made = root / name
+    made = root / weights
     made.mkdir()
     (made / "weights").write_text(weights)
-    (made / "fault").write_text(fault)
     return made
-
-
-def started(arguments: list[str]) -> subprocess.Popen[str]:
-    """Robots in a process of their own, ready."""
-    process = subprocess.Popen(
-        [sys.executable, __file__, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    if process.stdout.readline() != "ready\n":
-        raise SystemExit("robots did not start")
-    return process
 
 
 def again_s(answers: list[Any], server: str, event_s: float) -> tuple[int, float]:
@@ -286,29 +279,24 @@ def measured(answers: list[Any], begin_s: float, end_s: float) -> dict[str, Any]
     }
 
 
-def fleet(endpoints: list[str], count: int) -> list[subprocess.Popen[str]]:
-    """Robots at these servers, ready."""
-    shares = [(first, min(A_PROCESS, count - first)) for first in range(0, count, A_PROCESS)]
-    return [
-        started(["--endpoints", *endpoints, "--first", str(first), "--count", str(share)]) for first, share in shares
-    ]
-
-
 def ended(asking: list[subprocess.Popen[str]]) -> list[Any]:
     """What the robots counted until now."""
-    for process in asking:
-        assert process.stdin is not None
-        process.stdin.write("end\n")
-        process.stdin.flush()
-    return [robot for process in asking for robot in json.loads(process.communicate()[0].splitlines()[-1])]
+    printed = [process.communicate("end\n")[0] for process in asking]
+    return [robot for lines in printed for robot in json.loads(lines.splitlines()[-1])]
 
 
-def run(count: int, seconds: float, root: Path) -> int:
+def run(count: int, seconds: float, root: Path, stack: ExitStack) -> int:
     """All phases; 1 when a limit is missed."""
-    models = {name: folder(root, name, weights=name) for name in ("old", "new")}
+    models = {name: folder(root, name) for name in ("old", "new")}
     endpoints = [f"tcp/127.0.0.1:{free_port()}" for _ in range(3)]
     servers = [Server(models["old"], endpoint) for endpoint in endpoints]
-    asking = fleet(endpoints, count)
+    shares = [(first, min(A_PROCESS, count - first)) for first in range(0, count, A_PROCESS)]
+    asking = [
+        stack.enter_context(
+            started(__file__, "--endpoints", *endpoints, "--first", first, "--count", share, says="ready")
+        )[0]
+        for first, share in shares
+    ]
     events: dict[str, tuple[str, float]] = {}
     phases = {"before": time.monotonic() + seconds / 2}
     time.sleep(seconds)
@@ -365,70 +353,11 @@ def run(count: int, seconds: float, root: Path) -> int:
     return int(bool(late or drained or summary["wrong_answers"] or summary["worst_step"] > 1 or not trying))
 
 
-def health(endpoint: str) -> dict[str, Any]:
-    """What a server says of itself."""
-    network = transport(mode="client", connect=(endpoint,))
-    try:
-        answer: dict[str, Any] = json.loads(bytes(network.request(health_name("model"), b"", 5.0)))
-    finally:
-        network.close()
-    return answer
-
-
-def run_faults(count: int, seconds: float, root: Path) -> int:
-    """Servers with faults; 1 when a limit is missed."""
-    endpoints = {name: f"tcp/127.0.0.1:{free_port()}" for name in FAULTS}
-
-    def serve(name: str) -> Server:
-        canary = name == "canary"
-        model = folder(root, name, weights="new" if canary else "old", fault=FAULTS[name])
-        return Server(model, endpoints[name], *(("--canary", f"{CANARY_SHARE}%") if canary else ()))
-
-    with ThreadPoolExecutor() as pool:
-        servers = dict(zip(FAULTS, pool.map(serve, FAULTS), strict=True))
-    asking = fleet([*endpoints.values()], count)
-    time.sleep(seconds)
-    states = {name: health(endpoint) for name, endpoint in endpoints.items()}
-    answers = ended(asking)
-    for server in servers.values():
-        server.signal(signal.SIGTERM)
-    for server in servers.values():
-        server.end()
-
-    print(f"{'robot':>8} {'requests':>8} {'replaced':>8} {'failed':>8} {'in a row':>8}  servers")
-    names = {server.id: name for name, server in servers.items()}
-    ways = [[names[server] for _, server in robot["servers"]] for robot in answers]
-    for number, (robot, way) in enumerate(zip(answers, ways, strict=True)):
-        figures = " ".join(f"{robot[key]:>8}" for key in ("requests", "replaced", "failed", "in_a_row"))
-        print(f"{number:>8} {figures}  {' -> '.join(way)}")
-    print(
-        f"\n{'server':>8} {'requests':>8} {'errors':>8} {'p50 ms':>8} {'p99 ms':>8} {'state':>8} {'robots':>8}",
-        "at the end",
-    )
-    ever = {name: sum(name in way for way in ways) for name in FAULTS}
-    last = {name: sum(name == way[-1] for way in ways) for name in FAULTS}
-    for name, state in states.items():
-        keys = ("requests", "failed", "latency_p50_ms", "latency_p99_ms", "state")
-        print(f"{name:>8} {' '.join(f'{state[key]:>8}' for key in keys)} {ever[name]:>8} {last[name]:>10}")
-    worst = max(robot["in_a_row"] for robot in answers)
-    unused = [name for name in FAULTS if not ever[name]]
-    stayed = [name for name in ("slow", "canary") if last[name]]
-    share = states["canary"]["requests"] / sum(state["requests"] for state in states.values())
-    tried = f"{ever['canary']} of {count} tried it, with {share:.1%} of all requests"
-    print(f"\nthe canary asks for {CANARY_SHARE} % of the robots: {tried}; {last['canary']} are there at the end")
-    print(f"failed requests in a row: at most {worst}")
-    print(f"servers without robots: {', '.join(unused) or 'none'}; servers not left: {', '.join(stayed) or 'none'}")
-    wrong = sum(robot["wrong"] for robot in answers)
-    report(failed_in_a_row=worst, canary_share=share, not_left=len(stayed), wrong_answers=wrong)
-    return int(bool(worst > MOST_FAILURES or unused or stayed or wrong))
-
-
 def main() -> int:
     """As a made-up plugin, which `ibrobot serve` finds."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--faults", action="store_true")
-    parser.add_argument("--robots", type=int)
-    parser.add_argument("--seconds", type=float)
+    parser.add_argument("--robots", type=int, default=50)
+    parser.add_argument("--seconds", type=float, default=10.0, help="of each phase")
     parser.add_argument("--endpoints", nargs="+", help=argparse.SUPPRESS)
     parser.add_argument("--first", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--count", type=int, help=argparse.SUPPRESS)
@@ -437,10 +366,8 @@ def main() -> int:
         logging.disable(logging.CRITICAL)
         robots(given.endpoints, given.first, given.count)
         return 0
-    with plugin("sine_parts", PLUGIN) as root:
-        if given.faults:
-            return run_faults(given.robots or 12, given.seconds or 30.0, root)
-        return run(given.robots or 50, given.seconds or 10.0, root)
+    with plugin("sine_parts", PLUGIN) as root, ExitStack() as stack:
+        return run(given.robots, given.seconds, root, stack)
 
 
 if __name__ == "__main__":

@@ -21,17 +21,15 @@ import logging
 import math
 import sys
 import tempfile
-import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import attrs
-import mujoco
 import numpy as np
-from figures import report
-from guard_trials import CONFIGS, new_robot
-from ibrobot_kinematics import KinematicModel, PathConstraints, ToolConstraints, read_mjcf, robot_model
+import planning_scenes as scenes
+from apparatus import CONFIGS, report
+from guard_trials import new_robot
+from ibrobot_kinematics import KinematicModel, PathConstraints, ToolConstraints, robot_model
 from ibrobot_kinematics.path_constraints import AXES, direction
 from ibrobot_planning.planner import ConstrainedGoal, JointGoal, PlanRequest, PositionGoal
 from ibrobot_planning.planners.constrained import ConstrainedChecks, ConstrainedSpace
@@ -39,9 +37,11 @@ from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.rrt import RrtConnectPlanner
 from ibrobot_planning.planners.timing import motion_of
 from ibrobot_planning.world.collision import Collisions
-from ibrobot_planning.world.objects import Box, World, WorldObject
+from ibrobot_planning.world.objects import World
+from planning import Plans
+from referee import Referee
 
-from ibrobot_core.api import Context, PlanningError, Pose, Quaternion, Robot, SteppedClock, Vector, Vector3
+from ibrobot_core.api import Context, PlanningError, Robot, SteppedClock, Vector, Vector3
 from ibrobot_core.app import load_config
 
 ARMS = {"so101": 68, "ur5": 66, "fr3": 66}
@@ -54,7 +54,6 @@ PADDING_M, CLEARANCE_M = 0.005, 0.0049
 WITHIN_S, LONGEST_S = 5.0, 60.0
 """Time in which a problem is to be solved, and when a search ends: others may use the processor meanwhile."""
 FIRST_SEED = 10_000
-MOST_BOXES = 8
 _BEGINS, _STEPS = 30, 80
 """Samples of the start of a walk, and its steps."""
 _FARTHER_RAD, _FARTHER_M = 1.8, 0.4
@@ -64,14 +63,9 @@ type Random = np.random.Generator
 
 
 @attrs.frozen(eq=False)
-class Problem:
-    """From `start` to `goal`, both shape (J,) [rad], in `world`."""
+class Problem(scenes.Problem):
+    """From `start` to `goal`, both shape (J,) [rad], in `world`, under constraints."""
 
-    kind: str
-    seed: int
-    world: World
-    start: Vector
-    goal: Vector
     constraints: PathConstraints
 
 
@@ -87,7 +81,6 @@ class Station:
         self.planner = RrtConnectPlanner(RrtConnectOptions(padding=PADDING_M, planning_time=LONGEST_S), context)
         self.planner.load()
         self.lower, self.upper = robot.lower[self.order], robot.upper[self.order]
-        self.referee = Referee(self)
         self._rest = np.clip(np.zeros(len(robot.joints)), robot.lower, robot.upper)
         size = np.random.default_rng(0).uniform(robot.lower, robot.upper, (2000, len(robot.joints)))
         self.reach = float(np.percentile(np.linalg.norm(self.model.forward(size).position, axis=1), 95))
@@ -122,14 +115,14 @@ class Station:
         """A table with boxes and posts on it, at distances where the tool works."""
         top = self.robot.description.floor  # a planner keeps above this, too
         low = -0.03 if top is None else top - 0.01
-        things = {"table": box((0.0, 0.0, low), (3 * self.reach, 3 * self.reach, 0.02), 0.0)}
+        things = {"table": scenes.box(0.0, 0.0, low, 3 * self.reach, 3 * self.reach, 0.02)}
         for i in range(int(rng.integers(4, 8))):
             heading, away = rng.uniform(-2.4, 2.4), self.reach * rng.uniform(0.45, 0.95)
             wide, deep = self.reach * rng.uniform(0.04, 0.16, 2)
             tall = self.reach * rng.uniform(0.15, 0.7)
             lifted = self.reach * rng.uniform(0.2, 0.5) if rng.random() < 0.3 else 0.0
             place = away * np.cos(heading), away * np.sin(heading), lifted + tall / 2
-            things[f"box_{i}"] = box(place, (wide, deep, tall), rng.uniform(0, np.pi))
+            things[f"box_{i}"] = scenes.box(*place, wide, deep, tall, rng.uniform(0, np.pi))
         return World(things)
 
     def _constraints(self, kind: str, rng: Random) -> PathConstraints:
@@ -182,11 +175,6 @@ class Station:
         return self.model.forward(whole).position
 
 
-def box(place: tuple[float, ...], size: tuple[float, ...], yaw: float) -> WorldObject:
-    turn = Quaternion(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
-    return WorldObject(Box((size[0], size[1], size[2])), Pose(Vector3(*map(float, place)), turn))
-
-
 def narrowed(given: PathConstraints) -> PathConstraints:
     """Constraints with less room, which the known solution keeps."""
     region = given.region
@@ -198,64 +186,6 @@ def narrowed(given: PathConstraints) -> PathConstraints:
     return attrs.evolve(
         given, upright=upright, region=region, view_angle=WITNESS * given.view_angle if given.view else given.view_angle
     )
-
-
-class Referee:
-    """MuJoCo's model of an arm with boxes, and what it measures of a motion."""
-
-    def __init__(self, station: Station) -> None:
-        path = station.robot.description.mjcf
-        assert path is not None
-        spec = read_mjcf(path).spec.copy()
-        for body in spec.bodies:
-            geoms = list(body.geoms)
-            if not any(geom.contype or geom.conaffinity for geom in geoms):
-                for geom in geoms:
-                    geom.contype = 1
-        for number in range(MOST_BOXES):
-            body = spec.worldbody.add_body(name=f"world:{number}", mocap=True)
-            body.add_geom(name=f"world:{number}", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 0.1, 0.1])
-        self.model = spec.compile()
-        self.data = mujoco.MjData(self.model)
-        names = [self.model.geom(i).name for i in range(self.model.ngeom)]
-        self._objects = [i for i, name in enumerate(names) if name.startswith("world:")]
-        roots = self.model.body_weldid
-        solid = [i for i in range(self.model.ngeom) if self.model.geom_contype[i] or self.model.geom_conaffinity[i]]
-        self._links = [i for i in solid if i not in self._objects and roots[self.model.geom_bodyid[i]] != 0]
-        self._columns = [int(self.model.joint(name).qposadr[0]) for name in station.joints]
-        self._tip = self.model.site(station.model.tip).id
-
-    def place(self, world: World) -> None:
-        """Put boxes where a world has them, and the others out of the way. Only distances are measured."""
-        model, data, things = self.model, self.data, list(world.objects.values())
-        for number, geom in enumerate(self._objects):
-            if number >= len(things):
-                data.mocap_pos[number] = 0.0, 0.0, -100.0
-                continue
-            thing = things[number]
-            assert isinstance(thing.shape, Box)
-            place, turn = thing.pose.position, thing.pose.orientation
-            model.geom_size[geom] = np.array(thing.shape.size) / 2
-            model.geom_rbound[geom] = np.linalg.norm(thing.shape.size) / 2
-            data.mocap_pos[number] = place.x, place.y, place.z
-            data.mocap_quat[number] = turn.w, turn.x, turn.y, turn.z
-
-    def poses(self, positions: Vector) -> Iterator[tuple[Vector, Vector]]:
-        """Position [m], shape (3,), and axes, shape (3, 3), of the tool at each of configurations, shape (N, J)."""
-        for q in positions:
-            self.data.qpos[self._columns] = q
-            mujoco.mj_kinematics(self.model, self.data)
-            yield self.data.site_xpos[self._tip], self.data.site_xmat[self._tip].reshape(3, 3)
-
-    def clearance(self) -> float:
-        """Distance [m] of the moving links from the world at the last pose, at most 2 cm."""
-        least, places, bounds = 0.02, self.data.geom_xpos, self.model.geom_rbound
-        away = np.linalg.norm(places[self._links][:, None] - places[self._objects][None], axis=2)
-        away -= bounds[self._links][:, None] + bounds[self._objects][None]
-        for link, thing in np.argwhere(away < least).tolist():
-            pair = self._links[link], self._objects[thing]
-            least = min(least, mujoco.mj_geomDistance(self.model, self.data, *pair, least, None))
-        return least
 
 
 def off(given: PathConstraints, place: Vector, axes: Vector) -> dict[str, float]:
@@ -276,30 +206,20 @@ def off(given: PathConstraints, place: Vector, axes: Vector) -> dict[str, float]
 
 
 @attrs.define
-class Figures:
-    """What the planner made of the problems of a kind."""
+class Kept(Plans):
+    """Plans under constraints, and whether they keep them."""
 
+    slack: float = 1.001
     number: int = 0
-    walls: list[float] = attrs.field(factory=list)
-    """[s]."""
-    cpus: list[float] = attrs.field(factory=list)
-    """[s]."""
-    durations: list[float] = attrs.field(factory=list)
-    """Of the motions [s]."""
-    failed: list[str] = attrs.field(factory=list)
     violations: int = 0
     """Milliseconds in which a constraint is broken."""
     milliseconds: int = 0
     worst: float = -math.inf
     """Greatest excess [rad or m]."""
-    clearance: float = 0.02
-    """[m]."""
-    beyond: int = 0
-    """Motions beyond a limit of position, velocity or acceleration."""
     broken_without: int = 0
     """Plans without the constraint that break it."""
 
-    def run(self, station: Station, task: Problem) -> None:
+    def solve(self, station: Station, task: Problem) -> None:
         """Plan, and measure the motion."""
         self.number += 1
         station.planner.world = task.world
@@ -307,33 +227,18 @@ class Figures:
         if task.seed % 2:
             goal = PositionGoal(Vector3(*station._tip(task.goal).tolist()))
         request = PlanRequest(station.joints, task.start, ConstrainedGoal(goal, task.constraints))
-        wall, cpu = time.perf_counter(), time.process_time()
-        try:
-            result = station.planner.plan(request)
-        except PlanningError as error:
-            self.failed.append(f"{station.name} {task.kind} {task.seed}: {error.code.name}: {error}")
+        name = f"{station.name} {task.kind} {task.seed}"
+        motion = self.run(name, lambda: motion_of(station.planner.plan(request).trajectory))
+        if motion is None:
             return
-        self.walls.append(time.perf_counter() - wall)
-        self.cpus.append(time.process_time() - cpu)
-        motion = motion_of(result.trajectory)
-        assert motion is not None
-        self.durations.append(motion.duration)
-        positions, velocities, accelerations = motion.sampled(0.001)
-        robot, order = station.robot, station.order
-        self.beyond += bool(
-            (np.abs(velocities) > 1.001 * robot.max_velocity[order]).any()
-            or (np.abs(accelerations) > 1.001 * robot.max_acceleration[order]).any()
-            or (positions < station.lower - 1e-6).any()
-            or (positions > station.upper + 1e-6).any()
-        )
-        referee = station.referee
-        referee.place(task.world)
-        for number, (place, axes) in enumerate(referee.poses(positions)):
+        positions = self.check(station.robot, station.order.tolist(), motion)
+        assert station.robot.description.mjcf is not None
+        referee = Referee(station.robot.description.mjcf, station.joints, task.world, station.model.tip)
+        for place, axes in referee.poses(positions):
             most = max(off(task.constraints, place, axes).values())
             self.worst = max(self.worst, most)
             self.violations += most > 0
-            if number % 5 == 0:
-                self.clearance = min(self.clearance, referee.clearance())
+        self.clearance = min(self.clearance, referee.clearance(positions[::5]))
         self.milliseconds += len(positions)
         if task.kind != "upright":
             return
@@ -345,43 +250,12 @@ class Figures:
         poses = referee.poses(free.sampled(0.01)[0])
         self.broken_without += any(max(off(task.constraints, *pose).values()) > 0 for pose in poses)
 
-    @property
-    def within(self) -> int:
-        """Problems solved in time, by the processor's time: planning takes one thread."""
-        return sum(cpu <= WITHIN_S for cpu in self.cpus)
-
-    @property
-    def within_wall(self) -> int:
-        """The same by the clock on the wall."""
-        return sum(wall <= WITHIN_S for wall in self.walls)
-
-    def text(self) -> str:
+    def say(self) -> str:
         """One line."""
-        if not self.walls:
-            return f"solved 0/{self.number}"
-        times = ", ".join(
-            f"{name} {np.median(each):.2f} s (p95 {np.percentile(each, 95):.2f}, greatest {max(each):.2f})"
-            for name, each in (("wall", self.walls), ("CPU", self.cpus))
-        )
         return (
-            f"solved {len(self.walls)}/{self.number}, {self.within} within {WITHIN_S:g} s of CPU time"
-            f" ({self.within_wall} by the clock); {times}; motion"
-            f" {np.median(self.durations):.2f} s; {self.violations} of {self.milliseconds} ms break a constraint,"
-            f" nearest {self.worst:.2g} rad or m; clearance {1000 * self.clearance:.2f} mm; beyond limits {self.beyond}"
-            f"; without the constraint, {self.broken_without} plans break it"
+            f"{self.text(self.number, WITHIN_S)}; {self.violations} of {self.milliseconds} ms break a constraint,"
+            f" nearest {self.worst:.2g} rad or m; without the constraint, {self.broken_without} plans break it"
         )
-
-    def add(self, other: Figures) -> None:
-        """Add those of another kind or arm."""
-        for name in ("walls", "cpus", "durations", "failed"):
-            getattr(self, name).extend(getattr(other, name))
-        self.number += other.number
-        self.violations += other.violations
-        self.milliseconds += other.milliseconds
-        self.worst = max(self.worst, other.worst)
-        self.clearance = min(self.clearance, other.clearance)
-        self.beyond += other.beyond
-        self.broken_without += other.broken_without
 
 
 def made(name: str, folder: Path) -> Station:
@@ -400,37 +274,35 @@ def main() -> int:
     parser.add_argument("--arms", default=",".join(ARMS))
     parser.add_argument("--kinds", default=",".join(KINDS))
     arguments = parser.parse_args()
-    upright, others = Figures(), Figures()
+    upright, others = both = Kept(), Kept()
     with tempfile.TemporaryDirectory() as folder:
         stations = [made(name, Path(folder)) for name in arguments.arms.split(",")]
-    for kind in arguments.kinds.split(","):
-        for station in stations:
-            figures = Figures()
-            number = math.ceil(ARMS[station.name] * KINDS[kind] * arguments.problems / 200)
-            for seed in range(arguments.first, arguments.first + number):
-                figures.run(station, station.problem(kind, seed))
-            print(f"{station.name:6s} {kind:20s} {figures.text()}", flush=True)
-            (upright if kind == "upright" else others).add(figures)
-    print(f"upright, all arms: {upright.text()}")
-    for failure in (*upright.failed, *others.failed):
-        print(f"no plan: {failure}")
-    both = (upright, others)
+        for kind in arguments.kinds.split(","):
+            kept = upright if kind == "upright" else others
+            for station in stations:
+                number = math.ceil(ARMS[station.name] * KINDS[kind] * arguments.problems / 200)
+                for seed in range(arguments.first, arguments.first + number):
+                    kept.solve(station, station.problem(kind, seed))
+                print(f"to {kind}, {station.name}: {kept.say()}", flush=True)
+    for name, failure in (*upright.failed, *others.failed):
+        print(f"no plan: {name}: {failure}")
     report(
-        upright_solved_within_5_s=upright.within,
-        upright_within_5_s_by_the_clock=upright.within_wall,
+        upright_solved_within_5_s=upright.within(WITHIN_S)[0],
+        upright_within_5_s_by_the_clock=upright.within(WITHIN_S)[1],
         upright_problems=upright.number,
         upright_broken_without_constraint=upright.broken_without,
-        others_solved_within_5_s=others.within,
+        others_solved_within_5_s=others.within(WITHIN_S)[0],
         others_problems=others.number,
         violations=sum(each.violations for each in both),
         milliseconds=sum(each.milliseconds for each in both),
-        greatest_cpu_s=max((*upright.cpus, *others.cpus), default=math.nan),
+        greatest_cpu_s=max((*upright.cpus.values(), *others.cpus.values()), default=math.nan),
         least_clearance_mm=1000 * min(each.clearance for each in both),
     )
     good = all(
-        each.within == each.number and not each.violations and not each.beyond and each.clearance > CLEARANCE_M
+        each.within(WITHIN_S)[0] == each.number and not each.violations and not each.beyond
+        and each.clearance > CLEARANCE_M
         for each in both
-    )
+    )  # fmt: skip
     return 0 if good else 1
 
 

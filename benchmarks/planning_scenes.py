@@ -58,20 +58,21 @@ class Problem:
     goal: Vector
 
 
-def _box(x: float, y: float, z: float, sx: float, sy: float, sz: float, yaw: float = 0.0) -> WorldObject:
+def box(x: float, y: float, z: float, sx: float, sy: float, sz: float, yaw: float = 0.0) -> WorldObject:
+    """A box with its middle at a place, and sizes [m], turned about the vertical axis [rad]."""
     turn = Quaternion(0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
-    return WorldObject(Box((sx, sy, sz)), Pose(Vector3(float(x), float(y), float(z)), turn))
+    return WorldObject(Box((float(sx), float(sy), float(sz))), Pose(Vector3(float(x), float(y), float(z)), turn))
 
 
 def _table() -> dict[str, WorldObject]:
-    return {"table": _box(0.15, 0, -0.016, 0.9, 0.9, 0.02)}
+    return {"table": box(0.15, 0, -0.016, 0.9, 0.9, 0.02)}
 
 
 def _placed(parts: Mapping[str, tuple[float, ...]], x: float, y: float, z: float, yaw: float) -> dict[str, WorldObject]:
     """Boxes given in a frame of their own, as x, y, z and sizes."""
     c, s = np.cos(yaw), np.sin(yaw)
     return {
-        name: _box(x + c * px - s * py, y + s * px + c * py, z + pz, sx, sy, sz, yaw)
+        name: box(x + c * px - s * py, y + s * px + c * py, z + pz, sx, sy, sz, yaw)
         for name, (px, py, pz, sx, sy, sz) in parts.items()
     }
 
@@ -97,7 +98,7 @@ def _table_pick(rng: Random) -> Scene:
             things[f"can_{i}"] = WorldObject(shape, Pose(Vector3(float(x), float(y), float(height / 2))))
         else:
             width, depth = rng.uniform(0.03, 0.06, 2)
-            things[f"box_{i}"] = _box(x, y, height / 2, width, depth, height, rng.uniform(0, np.pi))
+            things[f"box_{i}"] = box(x, y, height / 2, width, depth, height, rng.uniform(0, np.pi))
     return things, regions
 
 
@@ -161,7 +162,7 @@ def _cage(rng: Random) -> Scene:
     for i, z in enumerate((rng.uniform(0.15, 0.19), 0.34)):
         for k, (a, b) in enumerate(pairwise(headings)):
             mid, reach, side = (a + b) / 2, radius * np.cos((b - a) / 2), 2 * radius * np.sin((b - a) / 2)
-            things[f"ring_{i}_{k}"] = _box(0.04 + reach * np.cos(mid), reach * np.sin(mid), z, bar, side, bar, mid)
+            things[f"ring_{i}_{k}"] = box(0.04 + reach * np.cos(mid), reach * np.sin(mid), z, bar, side, bar, mid)
     regions = []
     for gap in rng.permutation(number - 1)[:2]:
         mid = (headings[gap] + headings[gap + 1]) / 2

@@ -25,7 +25,7 @@ from typing import Any
 
 import attrs
 import numpy as np
-from figures import report
+from apparatus import report
 from ibrobot_diagnose.card import Card, make_card
 from ibrobot_diagnose.live import look
 from ibrobot_diagnose.preflight import Preflight, compared

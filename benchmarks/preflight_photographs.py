@@ -28,14 +28,12 @@ from pathlib import Path
 import attrs
 import cv2
 import numpy as np
-from figures import report
-from numpy.typing import NDArray
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "shared"))
+from apparatus import report
 from ibrobot_diagnose.pictures import shrink
 from ibrobot_diagnose.rig import STILL_WIDTH, Still
 from made_rigs import compared, rig
 from made_runs import JOINTS
+from numpy.typing import NDArray
 
 type Picture = NDArray[np.uint8]
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -25,17 +24,14 @@ from typing import Any, override
 import attrs
 import numpy as np
 import yaml
-from figures import report
+from apparatus import CONFIGS, ended, in_a_process, report, running
 
-from ibrobot_core.config import load_config
+from ibrobot_core.app import load_config
 from ibrobot_core.interfaces import Context, Sensor
-from ibrobot_core.interfaces.run import LaunchRequest
-from ibrobot_core.launch.runtime import Runtime
-from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import Header, Image
 from ibrobot_core.plugins import Registry, discover
 
-CONFIG = Path(__file__).parents[1] / "configs" / "so101.yaml"
+CONFIG = CONFIGS / "so101.yaml"
 ALLOWED_RATIO = 1.5
 
 
@@ -87,17 +83,8 @@ def run(seconds: float, root: Path | None) -> dict[str, Any]:
         path = Path(folder) / "so101.yaml"
         path.write_text(yaml.safe_dump(document, sort_keys=False))
         found = registry()
-        runtime = Runtime(
-            Session(load_config(path, sim=True, registry=found), found, LaunchRequest(duration_s=seconds))
-        )
-        runtime.start()
-        try:
-            while not runtime.wait(0.2):
-                pass
-            summary = runtime.summary()
-        finally:
-            runtime.stop()
-        runtime.raise_failure()
+        with running(load_config(path, sim=True, registry=found), found, duration_s=seconds) as runtime:
+            summary = ended(runtime)
     if root is not None:
         summary["kept"] = [bag(path) for path in sorted(root.glob("*/episodes/*"))]
     return summary
@@ -119,20 +106,12 @@ def bag(path: Path) -> dict[str, Any]:
     }
 
 
-def measure(seconds: float, root: Path | None) -> dict[str, Any]:
-    """One measurement, in a process of its own."""
-    command = [sys.executable, __file__, "--only", "on" if root else "off", "--seconds", str(seconds)]
-    ran = subprocess.run([*command, *(["--root", str(root)] if root else [])], stdout=subprocess.PIPE, check=True)
-    result: dict[str, Any] = json.loads(ran.stdout.splitlines()[-1])
-    return result
-
-
 def pairs(repetitions: int, seconds: float, root: Path | None) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
     """Measurements without and with recording; what was recorded is removed."""
     for number in range(repetitions):
-        off = measure(seconds, None)
+        off = in_a_process(__file__, "--only", "off", "--seconds", seconds)
         with tempfile.TemporaryDirectory(dir=root) as folder:
-            on = measure(seconds, Path(folder))
+            on = in_a_process(__file__, "--only", "on", "--seconds", seconds, "--root", folder)
         for name, result in (("without", off), ("recorded", on)):
             loop = result["loop"]
             rates = ", ".join(f"{camera} {rate:.1f}" for camera, rate in result["rates_hz"].items())

@@ -24,9 +24,8 @@ from pathlib import Path
 from typing import Any
 
 import attrs
-from figures import report
-
-IBROBOT = (sys.executable, "-c", "from ibrobot_core.cli.command import main; main()")
+from apparatus import report
+from ibrobot_testing import ibrobot_command
 
 
 @attrs.frozen
@@ -43,8 +42,8 @@ class Session:
 def record(folder: Path, asked: argparse.Namespace, *more: str) -> Session:
     """Record a session in a folder."""
     command = [
-        *IBROBOT, "record", asked.robot, "--sim", "--mode", "still", "--headless", "--auto", "--prompt", "pick",
-        "--events", "--json", "--set=control_modes.still={executors: [arm_position, gripper_position]}",
+        *ibrobot_command(), "record", asked.robot, "--sim", "--mode", "still", "--headless", "--auto", "--prompt",
+        "pick", "--events", "--json", "--set=control_modes.still={executors: [arm_position, gripper_position]}",
         f"--episodes={asked.episodes}", f"--reset-time={asked.pause}",
         f"--set=contract.max_duration_s={asked.seconds}", *more,
     ]  # fmt: skip
@@ -70,7 +69,9 @@ def record(folder: Path, asked: argparse.Namespace, *more: str) -> Session:
 def convert(folder: Path, out: str) -> float:
     """Convert all episodes; returns how long that takes [s]."""
     begin = time.monotonic()
-    subprocess.run([*IBROBOT, "convert", "episodes/default", "--out", out], cwd=folder, check=True, stdout=sys.stderr)
+    subprocess.run(
+        [*ibrobot_command(), "convert", "episodes/default", "--out", out], cwd=folder, check=True, stdout=sys.stderr
+    )
     return time.monotonic() - begin
 
 

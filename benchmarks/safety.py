@@ -17,7 +17,7 @@ import time
 from typing import Any
 
 import numpy as np
-from figures import report
+from apparatus import report
 
 from ibrobot_core.control.safety import SafetyLayer
 from ibrobot_core.robot import Joint, Robot

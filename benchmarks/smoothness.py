@@ -16,11 +16,10 @@ import json
 import sys
 from collections.abc import Iterator
 from itertools import product
-from pathlib import Path
 from typing import Any, override
 
 import numpy as np
-from figures import report
+from apparatus import CONFIGS, report
 from flow_policy import FlowPolicy
 
 from ibrobot_core.bus import Bus
@@ -40,7 +39,7 @@ from ibrobot_core.robot import Vector
 from ibrobot_core.schema import DispatchConfig
 from ibrobot_core.units import NS_PER_S, ns
 
-CONFIG = Path(__file__).parents[1] / "configs" / "so101_blind.yaml"
+CONFIG = CONFIGS / "so101_blind.yaml"
 LATENCIES_MS = (50, 200, 800)
 STRATEGIES = ("replace", "ensemble", "rtc")
 SPREAD, LOSS, OUTAGE_AT_S, OUTAGE_S = 0.5, 0.02, 25.0, 3.0

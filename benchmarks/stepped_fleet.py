@@ -22,7 +22,7 @@ from typing import Any, override
 
 import attrs
 import numpy as np
-from figures import report
+from apparatus import report
 from ibrobot_serve.fair_queue import FairQueue
 from ibrobot_serve.pacing import Pacing
 from ibrobot_testing import make_robot
@@ -53,6 +53,20 @@ START_S = 0.3
 """Within which all robots start."""
 SETTLED_S = 5.0
 """After which a run, and a recovery, is measured."""
+
+
+def fleet_contract() -> Contract:
+    """Of the robot for tests: its policy sees and moves all joints."""
+    robot = make_robot()
+    state = ObservationSpec("observation.state", topic="/joint_states")
+    config = RobotConfig(
+        robot=robot,
+        executors={"all": ExecutorConfig("position", Options(), "all", "all", robot.joint_names)},
+        control_modes={"idle": ControlMode(())},
+        default_control_mode="idle",
+        contract=ContractConfig(RATE_HZ, observations=(state,), actions=(ActionSpec("all", "/commands"),)),
+    )
+    return Contract.from_config(config)
 
 
 class Events:
@@ -146,17 +160,9 @@ class Robot(InferenceClient):
         """When each answer came, and how long after its observation [ns]."""
         self.holds: list[int] = []
         """When the plan ran dry [ns]."""
-        state = ObservationSpec("observation.state", topic="/joint_states")
         robot = make_robot()
-        config = RobotConfig(
-            robot=robot,
-            executors={"all": ExecutorConfig("position", Options(), "all", "all", robot.joint_names)},
-            control_modes={"idle": ControlMode(())},
-            default_control_mode="idle",
-            contract=ContractConfig(RATE_HZ, observations=(state,), actions=(ActionSpec("all", "/commands"),)),
-        )
         self._joints = robot.joint_names
-        contract = Contract.from_config(config)
+        contract = fleet_contract()
         spec = PolicySpec({"observation.state": (len(self._joints),)}, self._joints, len(self._joints), CHUNK)
         self._step_ns = contract.step_ns
         self.dispatcher = Dispatcher(

@@ -1,10 +1,11 @@
 """The whole path of a policy: record demonstrations, convert them, train on them, run the result, and count.
 
     python benchmarks/train_pick_cube.py [--episodes 100] [--steps 5000] [--trials 100] [--work pick_cube] [--onnx]
+        [--device cpu]
 
 1. `ibrobot record`: the scripted pick in simulation, in lockstep, without cameras; the cube's pose is an observation.
 2. `ibrobot convert`: a LeRobot dataset of the successes.
-3. `ibrobot train`: its small ACT (0.5 million parameters) on the CPU.
+3. `ibrobot train`: its small ACT (0.5 million parameters) on the CPU, or on a GPU with `--device cuda`.
 4. `ibrobot eval`: the trained policy in the same simulation, with cubes at places that were in no demonstration; with
    --onnx, also what `ibrobot export` makes of it, with the same seeds.
 
@@ -17,28 +18,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import sys
 from pathlib import Path
 from time import perf_counter
 
-from figures import report
+from apparatus import CONFIGS, ibrobot, report
 
-CONFIG = Path(__file__).parents[1] / "configs" / "so101_pick_cube.yaml"
+CONFIG = CONFIGS / "so101_pick_cube.yaml"
 FIRST_TRAINING_SEED = 1000
 """Trials have the seeds from 0 on."""
-NOT_ALL_SUCCEEDED = 3
-"""Exit code of `ibrobot record` when an episode failed."""
-
-
-def run(*command: str | Path) -> str:
-    """Run a command of this environment and return its last line; empty where it prints none."""
-    program = Path(sys.executable).with_name(str(command[0]))
-    print(f"$ {' '.join(str(word) for word in command)}", file=sys.stderr)
-    found = subprocess.run([program, *command[1:]], stdout=subprocess.PIPE, text=True, check=False)
-    if found.returncode not in (0, NOT_ALL_SUCCEEDED):
-        raise SystemExit(f"{command[0]} ended with {found.returncode}")
-    return found.stdout.strip().rpartition("\n")[2]
 
 
 def main() -> int:
@@ -48,46 +36,39 @@ def main() -> int:
     parser.add_argument("--trials", type=int, default=100, help="runs of the trained policy")
     parser.add_argument("--work", type=Path, default=Path("pick_cube"), help="folder of all that comes to be")
     parser.add_argument("--onnx", action="store_true", help="also run the exported policy")
+    parser.add_argument("--device", default="cpu", help="of training, and of the trained policy")
     arguments = parser.parse_args()
     work = arguments.work.absolute()
     episodes, dataset, trained, onnx = work / "episodes", work / "dataset", work / "train", work / "onnx"
     policy = trained / "checkpoints/last/pretrained_model"
     times_s = {}
-    stages = {
+    models: tuple[str | Path, ...] = ("--model", "act", "--set", f"models.act.path={policy}")
+    models += ("--set", f"models.act.device={arguments.device}")
+    stages: dict[str, tuple[Path, tuple[object, ...]]] = {
         "record": (
             episodes,
-            lambda: run(
-                "ibrobot", "record", CONFIG, "--sim", "--lockstep", "--headless", "--episodes",
-                str(arguments.episodes), "--seed", str(FIRST_TRAINING_SEED), "--root", episodes, "--dataset", "pick",
-                "--prompt", "put the cube into the bin",
+            (
+                CONFIG, "--sim", "--lockstep", "--headless", "--episodes", arguments.episodes, "--seed",
+                FIRST_TRAINING_SEED, "--root", episodes, "--dataset", "pick", "--prompt", "put the cube into the bin",
             ),
         ),
-        "convert": (
-            dataset,
-            lambda: run("ibrobot", "convert", episodes / "pick", "--out", dataset, "--outcome", "success"),
-        ),
-        "train": (
-            trained,
-            lambda: run(
-                "ibrobot", "train", dataset, "--out", trained, "--steps", str(arguments.steps), "--device", "cpu"
-            ),
-        ),
+        "convert": (dataset, (episodes / "pick", "--out", dataset, "--outcome", "success")),
+        "train": (trained, (dataset, "--out", trained, "--steps", arguments.steps, "--device", arguments.device)),
     }  # fmt: skip
-    models: tuple[str | Path, ...] = ("--model", "act", "--set", f"models.act.path={policy}")
     if arguments.onnx:
-        stages["export"] = (onnx, lambda: run("ibrobot", "export", policy, "--to", "onnx", "--out", onnx))
+        stages["export"] = (onnx, (policy, "--to", "onnx", "--out", onnx))
         models += ("--model", "onnx", "--set", f"models.onnx={{type: onnx, path: {onnx}}}")
-    for name, (result, work_on) in stages.items():
-        if not result.exists():
+    for name, (made, words) in stages.items():
+        if not made.exists():
             begin = perf_counter()
-            work_on()
+            ibrobot(name, *words, good=(0, 3))  # not all episodes succeeded
             times_s[name] = round(perf_counter() - begin)
     begin = perf_counter()
-    printed = run(
-        "ibrobot", "eval", CONFIG, "--sim", "--mode", "learned", "--episodes", str(arguments.trials), "--json",
-        *models, "--videos", "0", "--out", work / "evaluation",
+    printed = ibrobot(
+        "eval", CONFIG, "--sim", "--mode", "learned", "--episodes", arguments.trials, "--json",
+        *models, "--videos", 0, "--out", work / "evaluation",
     )  # fmt: skip
-    evaluation = json.loads(printed)
+    evaluation = json.loads(printed.strip().rpartition("\n")[2])
     found, *exported = evaluation["policies"]
     times_s["run"] = round(perf_counter() - begin)
     ends = [round(found["wilson"][end], 3) for end in ("low", "high")]

@@ -17,13 +17,13 @@ from ibrobot_kinematics.poses import matrix
 from ibrobot_planning.planner import JointGoal, PlanRequest
 from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.rrt import RrtConnectPlanner
+from ibrobot_planning.planners.timing import motion_of
 from ibrobot_planning.world.objects import Box, Cylinder, World
 from PIL import Image
 
 from ibrobot_core.api import Context, SteppedClock, Vector
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-from planning import motion_of
 from planning_scenes import ARM_JOINTS, KINDS, MJCF, Maker, so101
 
 SIZE = (480, 360)
@@ -100,9 +100,9 @@ def main() -> None:
         planner.world = problem.world
         result = planner.plan(PlanRequest(ARM_JOINTS, problem.start, JointGoal(ARM_JOINTS, problem.goal)))
         out = Path(__file__).with_name(f"plan_{kind}.webp")
-        picture(scene(problem.world), motion_of(result).sampled(0.01)[0], AZIMUTHS[kind]).save(
-            out, quality=70, method=6
-        )
+        motion = motion_of(result.trajectory)
+        assert motion is not None
+        picture(scene(problem.world), motion.sampled(0.01)[0], AZIMUTHS[kind]).save(out, quality=70, method=6)
         print(f"{out}: {out.stat().st_size / 1000:.0f} kB")
 
 

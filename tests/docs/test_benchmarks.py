@@ -26,9 +26,9 @@ def test_every_benchmark_has_a_claim() -> None:
     reporting = {
         path.name
         for path in (ROOT / "benchmarks").glob("*.py")
-        if path.name != "figures.py"
+        if path.name != "apparatus.py"
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("report", "figures.report")
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "report"
     }
     assert reporting == {claim.script.name for claim in CLAIMS}, "add a Claim to benchmarks/run.py"
 
@@ -53,7 +53,7 @@ def test_figures_are_compared_with_the_last_ones() -> None:
 
 
 def test_the_last_line_of_figures_counts(capsys: pytest.CaptureFixture[str]) -> None:
-    from figures import report, reported
+    from apparatus import report, reported
 
     report(p50=1.23456, missed=0)
     assert reported("noise\nfigures: {}\n" + capsys.readouterr().out) == {"p50": 1.235, "missed": 0.0}

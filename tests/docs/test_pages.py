@@ -144,7 +144,8 @@ def all_options(command: click.Command, context: click.Context) -> Iterator[str]
 
 
 def test_every_option_in_the_text_exists() -> None:
-    scripts = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "benchmarks").glob("*.py"))
+    programs = (*(ROOT / "benchmarks").glob("*.py"), *(ROOT / "tests/shared").glob("*.py"))
+    scripts = "".join(path.read_text(encoding="utf-8") for path in programs)
     own = re.findall(r'"(--[a-z][a-z-]*)"', scripts)
     known = {*all_options(cli, click.Context(cli)), *OF_OTHERS, *own, "--help"}
     named = [

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import experts
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -234,11 +235,8 @@ def test_tools_of_two_arms_are_named_by_their_arm() -> None:
 
 
 @pytest.mark.long
-def test_scripted_expert_through_poses_succeeds_as_through_joints(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
-    import cartesian_pick
-
-    results = [cartesian_pick.run(0, 100, given) for given in ((), cartesian_pick.CARTESIAN)]
-    assert results[1]["successes"] >= 95
-    assert results[1]["successes"] >= results[0]["successes"] - 2
-    assert results[1]["unreachable"] == 0
+def test_scripted_expert_through_poses_succeeds_as_through_joints() -> None:
+    joints, tool = (experts.run("so101_blind", None, given, 0, 100) for given in ((), experts.TOOL))
+    assert sum(tool.won) >= 95
+    assert sum(tool.won) >= sum(joints.won) - 2
+    assert tool.summary["unreachable"] == 0

@@ -1,4 +1,4 @@
-"""`benchmarks/guard.py` in miniature: commands for an SO-101, judged by MuJoCo's collision detection."""
+"""`tests/shared/guarded_commands.py` in miniature: commands for an SO-101, judged by MuJoCo's collision detection."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stops while the system is short of something: for each limit one run of `benchmarks/stop_under_limits.py`."""
+"""Stops while the system is short of something: for each limit one run of `tests/shared/stop_under_limits.py`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 pytestmark = pytest.mark.integration
 
-PROGRAM = Path(__file__).parents[2] / "benchmarks/stop_under_limits.py"
+PROGRAM = Path(__file__).parents[2] / "tests/shared/stop_under_limits.py"
 
 
 LONG = [pytest.param(kind, marks=pytest.mark.long) for kind in ("memory", "threads")]

@@ -23,15 +23,16 @@ from typing import Any
 import numpy as np
 import yaml
 from ibrobot_kinematics import robot_model
+from ibrobot_mujoco.so101 import so101
 from ibrobot_planning.execution.requests import MoveResult
 from ibrobot_planning.world.objects import Box, World, WorldObject
-from planning import Referee
-from planning_scenes import ARM_JOINTS
+from referee import Referee
 
 from ibrobot_core.api import Pose, Vector, Vector3
 from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
 
 CONFIG = Path(__file__).parents[2] / "configs" / "so101_blind.yaml"
+ARM_JOINTS = so101().joint_names[:5]
 MODE = "moveit_planning"
 BOX_M = 0.05
 REACTION_S = 0.25
@@ -125,7 +126,8 @@ def obstacles(number: int, seed: int) -> bool:
     wrong: list[str] = []
     with run(lockstep=True, seed=seed) as runtime:
         arm, robot = Arm(runtime), runtime.session.config.robot
-        model = robot_model(robot)
+        model, mjcf = robot_model(robot), robot.description.mjcf
+        assert mjcf is not None
         lower, upper = robot.lower[:5] * 0.8, robot.upper[:5] * 0.8
         rate = runtime.session.config.control.rate_hz
         arm.step(5)
@@ -142,7 +144,7 @@ def obstacles(number: int, seed: int) -> bool:
                 continue
             place = model.forward(free[hit]).position
             world = World({"box": WorldObject(Box((BOX_M,) * 3), Pose(Vector3(*place.tolist())))})
-            referee = Referee(world)
+            referee = Referee(mjcf, ARM_JOINTS, world)
             if referee.clearance(free[: when + int(REACTION_S * rate), :5]) < 0.015:
                 continue
             arm.commands.clear()

@@ -176,7 +176,7 @@ def run() -> Iterator[Drive]:
 
 
 class TestDrives:
-    """Each event once; `benchmarks/base_stops.py` has a thousand sequences."""
+    """Each event three times, in random sequences."""
 
     @pytest.mark.parametrize("event", [*FAULTS, "stop", "starved", "release", "silence"])
     def test_a_base_stands_in_time_and_moves_only_by_a_press(self, run: Drive, event: str) -> None:

@@ -1,4 +1,4 @@
-"""What `guard.py` runs: arms among objects, commanders that aim at contacts, and MuJoCo as the judge of their way."""
+"""What `guarded_commands.py` runs: arms among objects, commanders that aim at contacts, and MuJoCo as the judge."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from ibrobot_core.control.host import InlineControl
 from ibrobot_core.control.safety import SafetyLayer
 from ibrobot_core.interfaces.run_state import ControlState, PlanRecord
 
-CONFIGS = Path(__file__).parents[1] / "configs"
+CONFIGS = Path(__file__).parents[2] / "configs"
 PERIOD_NS = ns(0.01)
 MARGIN_M, SELF_MARGIN_M, PRESS_M = 0.003, 0.001, 0.01
 SIZES = {"post": (0.03, 0.03, 0.4), "bar": (0.04, 0.3, 0.04), "wall": (0.02, 0.6, 0.4), "cube": (0.06, 0.06, 0.06)}

@@ -1,6 +1,6 @@
 """A server killed in the middle of a request, again and again: the arm holds, and goes on once there is a server again.
 
-    python benchmarks/server_kill.py [--kills 20] [--slack 0]
+    python tests/shared/server_kill.py [--kills 20] [--slack 0]
 
 A robot in real time, its model of 60 ms in `ibrobot serve`, over Zenoh on this machine. Exits with 1 when the arm moved
 longer after a kill than its plan and one stale timeout, did not go on within a second of a restart, when the death of a
@@ -16,68 +16,26 @@ import logging
 import os
 import subprocess
 import sys
+import tempfile
 import threading
 import time
-from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from figures import report
+import pytest
 from ibrobot_testing.ports import free_port
-from made_up import plugin
+from ibrobot_testing.site import made_up_site
 
 from ibrobot_core.config import load_config
 from ibrobot_core.interfaces.run import LaunchRequest
 from ibrobot_core.launch.runtime import Runtime
 from ibrobot_core.launch.session import Session
 from ibrobot_core.messages import Float64MultiArray
-from ibrobot_core.plugins import discover
+from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.units import seconds
 
-PLUGIN = '''
-import time
-import attrs
-import numpy as np
-from ibrobot_core import hookimpl
-from ibrobot_core.descriptors import HardwareDescriptor, PolicyDescriptor
-from ibrobot_testing.fakes import FakeHardware, FakePolicy
-
-class Endless(FakeHardware):
-    def success(self):
-        return False
-
-class Sways(FakePolicy):
-    """Sways all joints; 60 ms a request, which it numbers."""
-    def __init__(self, ctx):
-        super().__init__(ctx)
-        self.spec = attrs.evolve(self.spec, chunk_size=12)
-        self.asked, self.answered = 0, []
-    def preprocess(self, frame):
-        self.asked += 1
-        times = frame.stamp_ns / 1e9 + np.arange(12) / 30
-        return {"phase": np.fmod(times, 2.0) * np.pi, "number": np.array([self.asked])}
-    def infer(self, tensors):
-        time.sleep(0.06)
-        return {"at": 0.4 * np.sin(tensors["phase"]), "number": tensors["number"]}
-    def postprocess(self, tensors):
-        self.answered.append(int(tensors["number"][0]))
-        return np.repeat(tensors["at"][:, None], self.spec.action_size, axis=1)
-
-MADE = []
-
-def make(options, ctx):
-    MADE.append(Sways(ctx))
-    return MADE[-1]
-
-@hookimpl
-def ibrobot_hardware():
-    yield HardwareDescriptor("endless", lambda options, ctx: Endless(ctx), "an arm", simulated=True)
-
-@hookimpl
-def ibrobot_policies():
-    yield PolicyDescriptor("sways", make, "sways")
-'''
+PLUGINS = Path(__file__).parent / "plugins"
 STALE_S = 0.25
 PLAN_S = 12 / 30
 RESUMED_S = 1.0
@@ -198,9 +156,7 @@ def run(kills: int, slack_s: float, folder: Path) -> int:
     port = free_port()
     endpoint = f"tcp/127.0.0.1:{port}"
     (folder / "mini.yaml").write_text(ROBOT.replace("PORT", str(port)))
-    mine = [entry for found in distributions(path=[str(folder)]) for entry in found.entry_points]
-    theirs = [entry for found in distributions() for entry in found.entry_points if entry.group == "ibrobot"]
-    registry = discover([entry for entry in (*theirs, *mine)])
+    registry = installed_plugins()
     server = Server(folder, endpoint)
     runtime = Runtime(
         Session(load_config(folder / "mini.yaml", sim=True, registry=registry), registry, LaunchRequest())
@@ -225,7 +181,7 @@ def run(kills: int, slack_s: float, folder: Path) -> int:
             )
         assert session.acting is not None
         stats = session.acting.dispatch
-        made = sys.modules["sways_parts"].MADE[0]
+        made = sys.modules["swaying"].MADE[0]
     finally:
         runtime.stop()
         server.kill()
@@ -245,12 +201,6 @@ def run(kills: int, slack_s: float, folder: Path) -> int:
         "last": grown[-1:],
     }
     print(json.dumps(summary))
-    report(
-        known_worst_ms=max(known) * 1e3,
-        held_worst_s=max(held),
-        resumed_worst_s=max(resumed),
-        answered_twice=len(answered) - len(set(answered)),
-    )
     first, last = (grown[0], grown[-1]) if grown else (resources(), resources())
     good = (
         max(held) <= PLAN_S + STALE_S + SETTLE_S + slack_s
@@ -266,14 +216,19 @@ def run(kills: int, slack_s: float, folder: Path) -> int:
 
 
 def main() -> int:
-    """As a made-up plugin, so that robot and server load the same policy."""
+    """Kill servers, and print what came of it; 1 when it is not as it must be."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--slack", type=float, default=0.0, help="[s]")
     arguments = parser.parse_args()
     logging.disable(logging.CRITICAL)
-    with plugin("sways_parts", PLUGIN) as folder:
-        return run(arguments.kills, arguments.slack, folder)
+    with (
+        tempfile.TemporaryDirectory() as made,
+        pytest.MonkeyPatch.context() as patches,
+        made_up_site(Path(made) / "site", PLUGINS, patches) as site,
+    ):
+        site.add("swaying", "swaying.py")
+        return run(arguments.kills, arguments.slack, Path(made))
 
 
 if __name__ == "__main__":
