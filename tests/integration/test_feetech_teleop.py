@@ -248,6 +248,7 @@ def test_a_servo_of_the_leader_that_dies_is_named(station: Callable[..., Station
     arms.until(lambda: not any(servo.torque for servo in arms.follower.servos.values()), "torque goes off")
 
 
+@pytest.mark.long  # the stepped tables of entrances and deadmen show this, with a simulated follower
 def test_the_emergency_stop_holds_until_the_reset(station: Callable[..., Station]):
     arms = station()
     arms.press_space()
