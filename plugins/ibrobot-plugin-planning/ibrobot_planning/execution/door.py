@@ -24,7 +24,6 @@ from ibrobot_core.api import (
     PlanCode,
     PlanningError,
     SlowDown,
-    Vector,
     ns,
     seconds,
 )
@@ -105,7 +104,8 @@ class GoalDoor(SessionWorker):
         """Executor -> the goal that it follows."""
         self._begun = threading.Condition()
         """Notified when goals begin or end."""
-        self._command: Vector | None = None
+        self._seen: ControlState | None = None
+        """The newest state that `_moved_ns` knows of."""
         self._moved_ns = np.full(len(self._robot.joints), -ns(1e6), dtype=np.int64)
         """When the command of each joint last changed [ns], shape (J,); long ago if it has not."""
         self.planner: Planner | None = None
@@ -218,6 +218,11 @@ class GoalDoor(SessionWorker):
         if touched := self.blocked(trajectory):
             raise PlanningError(f"the trajectory is not free: {touched}", PlanCode.INVALID_MOTION_PLAN)
 
+    @property
+    def at_rest(self) -> bool:
+        """Whether the commands of all joints are at rest: the safety layer may follow the executors with a delay."""
+        return self._rests(slice(None))
+
     def complete(self, trajectory: JointTrajectory) -> None:
         """Take note that a trajectory was completed from where the robot is, and is within the limits."""
         self._complete.append(trajectory)
@@ -304,11 +309,16 @@ class GoalDoor(SessionWorker):
         for _ in range(ticks):
             measured, state = session.measured().position, session.state
             assert state is not None
-            if state.stamp_ns >= self._moved_ns[order].max() + 2 * self._period_ns:
+            if self._rests(order):
                 return Start(state.command[order], measured=measured[order])
             if session.request.lockstep or states.get(_GLANCE_S) is None:
                 break
         raise PlanningError("the joints still move: wait until they are at rest", PlanCode.START_STATE_INVALID)
+
+    def _rests(self, order: Any) -> bool:
+        """Whether the commands of some joints have not changed for two ticks."""
+        seen = self._seen
+        return seen is not None and bool(seen.stamp_ns >= self._moved_ns[order].max() + 2 * self._period_ns)
 
     def _world(self) -> World:
         """The present world, with the floor."""
@@ -406,9 +416,9 @@ class GoalDoor(SessionWorker):
             self._begun.notify_all()
 
     def _take_state(self, state: ControlState) -> None:
-        if self._command is not None:
-            self._moved_ns[np.abs(state.command - self._command) > _STILL_RAD] = state.stamp_ns
-        self._command = state.command
+        if self._seen is not None:
+            self._moved_ns[np.abs(state.command - self._seen.command) > _STILL_RAD] = state.stamp_ns
+        self._seen = state
 
 
 _DOORS: WeakKeyDictionary[RunView, GoalDoor] = WeakKeyDictionary()

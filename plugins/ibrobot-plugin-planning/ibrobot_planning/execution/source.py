@@ -10,7 +10,6 @@ from types import NoneType
 from typing import Any, override
 
 import attrs
-import numpy as np
 
 from ibrobot_core.api import (
     HardwareError,
@@ -25,7 +24,6 @@ from ibrobot_core.api import (
 )
 from ibrobot_core.app import (
     ControlMode,
-    ControlState,
     GoalRun,
     NoRequest,
     Received,
@@ -127,8 +125,6 @@ _GLANCE_S = 0.5
 _BUSY_S = 0.01
 """Longest wait of a unit of work while the robot moves [s]."""
 _ENDED = MoveResult(False, "the mode or the run ended, or control was reset", 0.0, "CANCELLED", PlanCode.PREEMPTED)
-_STILL_RAD = 1e-4
-"""Commands that change less between two checks count as at rest."""
 _POLICIES: tuple[OrientationPolicy, ...] = ("keep_axis", "arm_plane", "current", "free")
 
 
@@ -186,7 +182,6 @@ class PlannerSource(SourceWorker):
         """Held while a goal is handed over, so that the last one is of the newest era."""
         self._choosing = threading.Lock()
         """Held while the move under way changes."""
-        self._last_state: ControlState | None = None
         self._era = 0, 0
         """Numbers of the emergency stops and of the generation that topics of goals were last read in."""
         for goal in session.request.goals if session.state is None else ():
@@ -286,7 +281,7 @@ class PlannerSource(SourceWorker):
             if self._move is not None:
                 self._following(self._move, self._execution.step)
                 self._end_at_rest(self._move)
-            if self._move is None and self._queue and self._at_rest() and not self._awaits_world():
+            if self._move is None and self._queue and door_of(self.session).at_rest and not self._awaits_world():
                 self._begin(self._queue.popleft())
             if self._move is not None and self.session.clock.now_ns() - self._status_ns >= _STATUS_NS:
                 self._show("executing")
@@ -492,14 +487,6 @@ class PlannerSource(SourceWorker):
     def _awaits_world(self) -> bool:
         """Whether the first message of a cloud may still come, shortly after the start."""
         return observed_world(self.session.bus).is_awaited
-
-    def _at_rest(self) -> bool:
-        """Whether the commands are at rest: the safety layer may follow the executors with a delay."""
-        state, seen = self.session.state, self._last_state
-        if state is None or (seen is not None and state.stamp_ns == seen.stamp_ns):
-            return False
-        self._last_state = state
-        return seen is not None and bool(np.abs(state.command - seen.command).max() < _STILL_RAD)
 
     def _begin(self, move: _Move) -> None:
         move.begun_ns = self.session.clock.now_ns()
