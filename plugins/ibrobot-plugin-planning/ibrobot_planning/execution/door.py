@@ -218,6 +218,11 @@ class GoalDoor(SessionWorker):
         if touched := self.blocked(trajectory):
             raise PlanningError(f"the trajectory is not free: {touched}", PlanCode.INVALID_MOTION_PLAN)
 
+    def track(self, executor: str, goal_id: str) -> Track:
+        """The track of a goal that was just sent to an executor; without a trajectory if it follows none."""
+        track = self._tracks.get(executor)
+        return track if track is not None and track.goal_id == goal_id else Track(goal_id, None)
+
     @property
     def at_rest(self) -> bool:
         """Whether the commands of all joints are at rest: the safety layer may follow the executors with a delay."""

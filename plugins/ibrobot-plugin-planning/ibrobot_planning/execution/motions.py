@@ -192,7 +192,6 @@ class Execution:
             if track is None or track.goal_id != event["goal"]:
                 return None
             if state == "executing":
-                track.begin_ns = event["result"].get("begin_ns")
                 return None
             del self._tracks[name]
         return "" if state == "succeeded" else f"{name} {state}: {event['message']}"
@@ -211,11 +210,10 @@ class Execution:
         return ""
 
     def _send(self, name: str, goal_id: str, goal: ExecutorGoal) -> None:
-        trajectory = goal.trajectory if isinstance(goal, FollowTrajectory) else None
-        if trajectory is not None:
-            self._door.complete(trajectory)
+        if isinstance(goal, FollowTrajectory):
+            self._door.complete(goal.trajectory)
         self._session.send_goal(name, goal_id, goal, self._stops)
-        self._tracks[name] = Track(goal_id, trajectory)
+        self._tracks[name] = self._door.track(name, goal_id)
 
     def _begin(self, name: str, following: _Next) -> bool:
         """Send a goal to an executor at rest; True, as it needs no retry."""
