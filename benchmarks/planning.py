@@ -27,7 +27,7 @@ from ibrobot_planning.planners.options import RrtConnectOptions
 from ibrobot_planning.planners.rrt import RrtConnectPlanner
 from ibrobot_planning.planners.timing import Motion, motion_of
 from planning_scenes import ARM_JOINTS, KINDS, MJCF, PADDING_M, Maker, Problem, so101
-from referee import FAR_M, Referee
+from referee import Referee
 
 from ibrobot_core.api import Context, PlanningError, Robot, SteppedClock, Vector
 
@@ -60,8 +60,8 @@ class Plans:
     failed: list[tuple[Any, str]] = attrs.field(factory=list)
     slack: float = 1.0
     """Times by which velocities and accelerations may be larger than their limits."""
-    clearance: float = FAR_M
-    """Least one of the motions [m]."""
+    clearance: float = np.inf
+    """Least one of the motions [m]; infinite where it was not measured."""
     beyond: int = 0
     """Number of motions beyond the limits."""
 
@@ -113,10 +113,12 @@ class Plans:
             f"{name} {np.median(each):.1f} ms (p95 {np.percentile(each, 95):.1f}, most {each.max():.1f})"
             for name, each in all_ms.items()
         )
+        measured = f"; clearance {1000 * self.clearance:.2f} mm, beyond the limits {self.beyond}"
         return (
             f"solved {len(self.walls)}/{number}, {wall} (CPU time: {cpu}) within {limit_s:g} s; {times}; motion"
-            f" {np.median(list(self.durations.values())):.2f} s; clearance {1000 * self.clearance:.2f} mm;"
-            f" beyond the limits {self.beyond}" + (f"; failed {self.failed[:3]}" if self.failed else "")
+            f" {np.median(list(self.durations.values())):.2f} s"
+            + (measured if np.isfinite(self.clearance) else "")
+            + (f"; failed {self.failed[:3]}" if self.failed else "")
         )
 
 
