@@ -47,6 +47,7 @@ def ready_forkserver() -> Iterator[None]:
     forkserver.ensure_running()
     yield
     server._stop()
+    forkserver.ensure_running()  # for conversions in later tests, in which a new one would be a leak
 
 
 class Here(Pool):
