@@ -181,6 +181,12 @@ def test_joint_named_twice_is_refused(run):
         runtime.session.bus.call(EXECUTE, asked(trajectory((0, [0.0] * 6), (1, [0.0] * 6), names=("pan", *ARM))))
 
 
+def test_joint_named_twice_is_refused_for_every_executor():
+    wanted = trajectory((0, [0.0, 0.0]), (1, [0.5, 0.5]), fields=3, names=("pan", "pan"))
+    with pytest.raises(PlanningError, match="joint_names is pan, pan; it must have each joint once"):
+        completed(wanted, Start(np.zeros(2)), ONE, PERIOD_NS)
+
+
 @pytest.mark.parametrize("fields", [1, 2, 3], ids=["positions", "velocities", "accelerations"])
 def test_given_trajectory_is_followed_within_the_limits(run, fields: int):
     runtime = at_up(run)

@@ -195,6 +195,8 @@ def _order(names: Sequence[str], joints: Sequence[str]) -> list[int]:
     """Index in `names` of each of `joints`."""
     if sorted(names) != sorted(joints):
         raise GoalRejected(f"joint_names must be, in any order, {', '.join(joints)}; got {', '.join(names) or 'none'}")
+    if len(set(names)) < len(names):
+        raise GoalRejected(f"joint_names is {', '.join(names)}; it must have each joint once")
     return [names.index(joint) for joint in joints]
 
 
