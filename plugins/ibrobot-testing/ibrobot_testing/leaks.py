@@ -125,7 +125,7 @@ def _open_files() -> dict[int, str]:
 
 
 def _child_processes() -> dict[int, str]:
-    """Process id -> command line of every child, including zombies."""
+    """Process id -> command line of every child, or else its name; including zombies."""
     processes: dict[int, str] = {}
     tasks = "/proc/self/task"
     for task in os.listdir(tasks) if os.path.exists(tasks) else ():
@@ -135,7 +135,9 @@ def _child_processes() -> dict[int, str]:
             pids = children.read().split()
         for pid in pids:
             with suppress(FileNotFoundError, ProcessLookupError):
-                processes[int(pid)] = Path(f"/proc/{pid}/cmdline").read_text(errors="replace").replace("\0", " ")
+                command = Path(f"/proc/{pid}/cmdline").read_text(errors="replace").replace("\0", " ")
+                # A process that begins or has ended has none.
+                processes[int(pid)] = command or Path(f"/proc/{pid}/comm").read_text(errors="replace").strip()
     return processes
 
 

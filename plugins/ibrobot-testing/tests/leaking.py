@@ -31,7 +31,11 @@ class LeavesAProcess(FakeSensor):
     def open(self) -> None:
         super().open()
         # It ends with this process, which closes its input.
-        kept.append(subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE))
+        command = [sys.executable, "-c", "print(flush=True); input()"]
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        assert process.stdout is not None
+        process.stdout.readline()  # it has begun
+        kept.append(process)
 
 
 class LeavesAFile(FakeSensor):

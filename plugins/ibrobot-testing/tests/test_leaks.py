@@ -38,7 +38,7 @@ def complaints(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     ("suite", "complaint"),
     [
         ("Thread", r"the test left behind: thread 'grabber'"),
-        ("Process", r"the test left behind: process \d+: .* -c input\(\)"),
+        ("Process", r"the test left behind: process \d+: .* -c print\(flush=True\); input\(\)"),
         ("File", r"the test left behind: open file \d+: /\S+"),
         ("Port", r"the test left behind: port \d+ on 127\.0\.0\.1"),
     ],
