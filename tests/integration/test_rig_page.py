@@ -15,6 +15,14 @@ pytestmark = [
     pytest.mark.usefixtures("rendering"),
 ]
 _SCENE = "  scene: pick_cube\n"
+_SLOW = """
+const usual = window.fetch;
+window.fetch = async (address, ...rest) => {
+  if (String(address).includes("devices/state")) await new Promise((answer) => setTimeout(answer, 500));
+  return usual(address, ...rest);
+};
+"""
+"""Each look at the steps of a guide takes so long that a click begins the next one meanwhile: none shows twice."""
 _TURNED = "  scene: {type: pick_cube, camera_turn: [0.012, 0.012]}\n"
 
 
@@ -31,6 +39,7 @@ def test_a_moved_camera_is_found_and_put_back(tmp_path: Path) -> None:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = browser.new_page(device_scale_factor=0.5)
         page.context.set_default_timeout(120_000)
+        page.add_init_script(_SLOW)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(address)
         page.get_by_role("link", name="Preflight", exact=True).click()

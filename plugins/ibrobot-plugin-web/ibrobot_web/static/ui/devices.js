@@ -64,10 +64,15 @@ export class View {
   async poll() {
     clearTimeout(this.timer);
     if (!this.shown) return;
+    const asked = this.asked = Symbol("poll");
     let found;
     try {
       found = await this.ui.get("devices/state", { after: this.items.length });
     } catch {
+      found = null;
+    }
+    if (asked !== this.asked) return; // a later poll asked for the same items
+    if (!found) {
       this.timer = setTimeout(() => this.poll(), 1000);
       return;
     }
