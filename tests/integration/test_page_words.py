@@ -57,9 +57,9 @@ CARD = """async (job) => {
   return [card.facts.textContent, card.error.textContent, card.problems.textContent];
 }"""
 """What the card of a job says: its state, why it failed, and what went wrong with parts of it."""
-VALUES: dict[str, tuple[Any, ...]] = {
-    "int": (1, 3), "float": (2.5, 90.0), "bool": (False, True), "str": ("X",), "tuple[str, ...]": ((), ("X",)),
-    "int | None": (None, 3), "float | None": (None, 2.5, 90.0),
+VALUES: dict[Any, tuple[Any, ...]] = {
+    int: (1, 3), float: (2.5, 90.0), bool: (False, True), str: ("X",), tuple[str, ...]: ((), ("X",)),
+    int | None: (None, 3), float | None: (None, 2.5, 90.0),
 }  # fmt: skip
 LINES = {
     "Nothing was found in 4 episodes.": "没有发现问题",
@@ -77,7 +77,9 @@ def made_up(kind: type[Event]) -> Iterator[Event]:
     """Events of a kind with different values."""
     for i in range(3):
         values = {
-            each.name: VALUES[str(each.type)] for each in attrs.fields(kind) if i or each.default is attrs.NOTHING
+            each.name: VALUES[each.type]
+            for each in attrs.fields(attrs.resolve_types(kind))
+            if i or each.default is attrs.NOTHING
         }
         yield kind(**{name: each[min(i, len(each) - 1)] for name, each in values.items()})
 
