@@ -1,4 +1,4 @@
-"""The door through which all goals of trajectories pass, of any client: completed, within the limits, free."""
+"""The door of all goals, of any client: trajectories are completed, checked, and watched while they move."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Execution of planned motions by the executors of a mode: begin, blend, stop, supervise."""
+"""Execution of planned motions by the executors of a mode: begin, blend, stop."""
 
 from __future__ import annotations
 
