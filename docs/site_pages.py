@@ -58,8 +58,8 @@ def connect(app: Sphinx, generated: Mapping[str, Page], *, are_read: bool = Fals
 def make_navigation_once(app: Sphinx) -> None:
     """Give each page the navigation that Furo makes of all titles, with its own links and marks, made once for all.
 
-    Without this, Sphinx and Furo build the whole navigation again for each page, which takes half of a build's time. The
-    pages do not change.
+    Without this, Sphinx and Furo build the whole navigation again for each page, which takes half of a build's time.
+    The pages do not change.
     """
     made: list[str] = []
 
