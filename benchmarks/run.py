@@ -235,13 +235,6 @@ CLAIMS = (
         "docs/how-to/add-a-camera.md",
         "camera_mount.py",
     ),
-    Claim(
-        "identify",
-        "from five minutes of a simulated arm with planted parameters, `ibrobot identify` finds its delay, and of each"
-        " joint the gain, the damping and the motion that is lost on a reversal within 10 %",
-        "docs/how-to/simulate-your-arm.md",
-        "identify.py",
-    ),
 )
 
 
