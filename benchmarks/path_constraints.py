@@ -228,7 +228,7 @@ class Kept(Plans):
             goal = PositionGoal(Vector3(*station._tip(task.goal).tolist()))
         request = PlanRequest(station.joints, task.start, ConstrainedGoal(goal, task.constraints))
         name = f"{station.name} {task.kind} {task.seed}"
-        motion = self.run(name, lambda: motion_of(station.planner.plan(request).trajectory))
+        motion = self.run(name, station.planner, request)
         if motion is None:
             return
         positions = self.check(station.robot, station.order.tolist(), motion)

@@ -122,10 +122,10 @@ CLAIMS = (
     ),
     Claim(
         "planning",
-        "plans around obstacles keep the clearance and the limits, and take no longer than roboplan's",
+        "plans around obstacles keep the clearance and the limits; 95 % take at most 1 s of processor time,"
+        " in a cage 10 s",
         "docs/how-to/plan-around-obstacles.md",
-        "planning.py --roboplan",
-        "`roboplan==0.7.0`",
+        "planning.py",
     ),
     Claim(
         "path_constraints",
