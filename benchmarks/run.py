@@ -228,13 +228,6 @@ CLAIMS = (
         "preflight_photographs.py PHOTOGRAPHS/fresh --unchanged 5",
         "the photographs that the script names: `run.py --photographs FOLDER`",
     ),
-    Claim(
-        "camera_mount",
-        "with 1 pixel of noise and 20 % of wrong pictures, `ibrobot camera mount` finds the mount of a camera in the"
-        " hand or on a stand within 3 mm and 0.5 degrees, or says that it cannot",
-        "docs/how-to/add-a-camera.md",
-        "camera_mount.py",
-    ),
 )
 
 
