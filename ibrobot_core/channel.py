@@ -16,12 +16,14 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from contextlib import suppress
 from itertools import islice
 from typing import Any
 
 _SIZES = struct.Struct("<II")
+_BUFFER = 1 << 16
+"""Most bytes read at once, unless a frame lacks more."""
 _LONGEST, _LARGEST = 64 << 20, 256 << 20
 """Most bytes of a text, and with it; a peer that announces more is disconnected, as is one that leaves more unread."""
 
@@ -52,10 +54,10 @@ class Channel:
         self._wake, self._waker = os.pipe()
         os.set_blocking(self._waker, False)
         self._frames = self._read_frames()
-        self._missing = next(self._frames)
+        self._room = next(self._frames)
         self._arrived: list[ChannelMessage] = []
         self.closed = False
-        """Whether the peer has closed the connection or died."""
+        """Whether the peer has closed the connection or died; known once all that it sent has been received."""
         self.backlog = 0
         """Number of bytes that the peer has not read yet."""
         self.dropped = 0
@@ -157,38 +159,52 @@ class Channel:
         if self.backlog:
             with self._sending:
                 self._flush()
-        while not self.closed:
+        drained = False
+        while not (self.closed or drained):
             try:
-                count = self._socket.recv_into(self._missing)
+                count = self._socket.recv_into(self._room)
             except BlockingIOError:
                 return
             except OSError:
                 count = 0
-            self._missing = self._missing[count:]
-            self.closed = not count
-            if not self._missing:
-                self._missing = next(self._frames)
+            self.closed = self.closed or not count
+            drained = count < len(self._room)
+            self._room = self._frames.send(count)
 
-    def _read_frames(self) -> Iterator[memoryview]:
-        """Take frame after frame; yields the memory that the next bytes belong in."""
-        sizes = memoryview(bytearray(_SIZES.size))
+    def _read_frames(self) -> Generator[memoryview, int, None]:
+        """Take frame after frame; yields the memory that the next bytes belong in, and is sent their number."""
+        buffer = memoryview(bytearray(_BUFFER))
+        filled = 0
         while True:
-            yield sizes
-            size, payload = _SIZES.unpack(sizes)
-            if not size or size > _LONGEST or payload > _LARGEST:
-                self.closed = True
-                size = payload = 0
-            block = memoryview(bytearray(size + payload))
-            yield block
-            try:
-                word, content = json.loads(bytes(block[:size]))
-                if not isinstance(word, str) or not isinstance(content, dict):
-                    raise ValueError("neither a message nor a report")
-                message = ChannelMessage(content)
-                message.word, message.payload = word, block[size:]
-                self._arrived.append(message)
-            except (ValueError, TypeError, RecursionError):
-                self.dropped += 1
+            filled += yield buffer[filled:]
+            begin = 0
+            while filled - begin >= _SIZES.size and not self.closed:
+                size, payload = _SIZES.unpack_from(buffer, begin)
+                if not size or size > _LONGEST or payload > _LARGEST:
+                    self.closed = True
+                    break
+                block = memoryview(bytearray(size + payload))
+                begin += _SIZES.size
+                read = min(len(block), filled - begin)
+                block[:read] = buffer[begin : begin + read]
+                begin += read
+                while read < len(block):
+                    read += yield block[read:]
+                self._take(block[:size], block[size:])
+            buffer[: filled - begin] = buffer[begin:filled]
+            filled -= begin
+
+    def _take(self, text: memoryview, payload: memoryview) -> None:
+        try:
+            word, content = json.loads(bytes(text))
+            if not isinstance(word, str) or not isinstance(content, dict):
+                raise ValueError("neither a message nor a report")
+        except (ValueError, TypeError, RecursionError):
+            self.dropped += 1
+            return
+        message = ChannelMessage(content)
+        message.word, message.payload = word, payload
+        self._arrived.append(message)
 
 
 def _frame(message: Mapping[str, Any], payload: Iterable[Any], word: str = "message") -> list[memoryview]:

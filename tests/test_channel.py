@@ -113,8 +113,8 @@ class TestChannel:
         peer.close()
 
         assert channel.next(0.0) == {"event": "stopped"}
-        assert channel.closed
         assert channel.next(None) is None
+        assert channel.closed
         assert channel.receive(None) == []
 
     def test_sending_to_a_dead_peer_raises_nothing(self, ends):
@@ -251,7 +251,7 @@ class TestStrangers:
         channel = Channel(ours)
         theirs.sendall(struct.pack("<II", text, payload))
         channel.receive()
-        closed, held = channel.closed, len(channel._missing)
+        closed, held = channel.closed, len(channel._room)
         channel.close()
         theirs.close()
 
