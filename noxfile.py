@@ -93,6 +93,8 @@ NOT_TESTED = Path(os.environ.setdefault("NOX_NOT_TESTED", str(Path(f".nox/not-te
 """The file of what no session could test on this machine, and what to do about it."""
 PROCESSOR = Path(os.environ.setdefault("NOX_PROCESSOR", str(Path(f".nox/processor-{os.getpid()}").absolute())))
 """The file with the processor time of each session."""
+BYTECODE = Path(".nox/bytecode").absolute()
+"""What Python compiled of installed packages, for all environments."""
 if not IS_FIRST and "integration" not in sys.argv:
     # All others end beside the longest one if they leave the processor to it. Linux shares the processor among the
     # sessions of processes first, and each of nox is one.
@@ -116,7 +118,23 @@ def packages(*requirements: str, plain: tuple[str, ...] = ()) -> list[str]:
             wanted += map(Requirement, project["dependencies"])
     asked = [str(each) for each in wanted[: len(requirements)] if each.name not in folders]
     extras = {name: extra for name, extra in EXTRAS.items() if name not in plain}
+    local.remove("ibrobot-core")  # all need it: uv finds it in the workspace, and builds it once for all sessions
     return [*(argument for name in local for argument in ("-e", f"{folders[name]}{extras.get(name, '')}")), *asked]
+
+
+def share_bytecode(environment: Path) -> None:
+    """Let an environment use what Python compiled in others of the same packages, and leave there what it compiles.
+
+    Python recognizes it by the time and size of the source: uv links that to one file in all environments.
+    """
+    for packages in environment.glob("lib/python*/site-packages"):
+        for folder, _, files in os.walk(packages):
+            source = next((name for name in files if name.endswith(".py")), None)
+            if source and Path(folder, source).stat().st_nlink > 1:  # a copy of its own has a time of its own
+                shared = BYTECODE / Path(folder).relative_to(packages)
+                shared.mkdir(parents=True, exist_ok=True)
+                with contextlib.suppress(FileExistsError):
+                    Path(folder, "__pycache__").symlink_to(shared)
 
 
 def install(
@@ -127,6 +145,7 @@ def install(
     distributions = ("ibrobot-core", *(FOLDERS[name].name for name in plugins))
     groups_need = nox.project.dependency_groups(PROJECT, *groups)
     session.install("-c", "constraints.txt", *options, *packages(*distributions, *groups_need, plain=plain))
+    share_bytecode(Path(session.virtualenv.location))
 
 
 def lacking(session: nox.Session, python: str) -> list[dict[str, Any]]:
@@ -241,7 +260,7 @@ def minimums(session: nox.Session) -> None:
 
     Every test of code runs, with few examples of Hypothesis: the search for rare ones is that of the other sessions.
     """
-    install(session, *PLUGINS, options=("--resolution=lowest-direct",))
+    install(session, *PLUGINS, options=("--resolution=lowest-direct", "-e", "."))  # core's requirements are direct, too
     system_libraries(session)
     few = ("--hypothesis-profile=few", "-m", "not integration and not lerobot and not long")
     # These read files, or break devices on purpose, whatever the versions; suites run in the tests of all plugins.
@@ -305,6 +324,7 @@ def check_wheels(session: nox.Session, folder: Path) -> None:
         fresh = (f"--refresh-package={name}" for name in LOCAL)
         wheels = ("--find-links", str(folder / "dist"), "-c", "constraints.txt", *fresh)
         session.run("uv", "pip", "install", "--quiet", "--python", str(environment), *wheels, requirement)
+        share_bytecode(environment)
         lacks = system_libraries(session, str(environment / "bin/python"))
         with session.chdir(folder):  # away from this repository
             for command in commands:
