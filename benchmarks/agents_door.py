@@ -1,6 +1,6 @@
 """What a flood of an agent's calls costs control, and how late an agent's stop is.
 
-    python benchmarks/agents_door.py [--pairs 2] [--seconds 20] [--stops 50] [--out FILE]
+    python benchmarks/agents_door.py [--pairs 2] [--seconds 20] [--stops 50]
 
 The simulated SO-101 in real time, with posts around it and the planner around obstacles. An agent in a process of its
 own, without any grant, calls over HTTP: it asks for plans and cancels them as fast as it can, with eight calls open. In
@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import json
 import multiprocessing
 import os
 import statistics
@@ -24,18 +23,17 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import httpx2
 import numpy as np
-from apparatus import CONFIGS, report
+from apparatus import CONFIGS, report, running
 from ibrobot_mcp.door import AgentDoor
 from ibrobot_mcp.tokens import add_token
 from mcp import Client, MCPError
 from mcp.client.streamable_http import streamable_http_client
 
-from ibrobot_core.app import LaunchRequest, Runtime, Session, installed_plugins, load_config
+from ibrobot_core.app import Runtime, Session, installed_plugins, load_config
 
 CONFIG = CONFIGS / "so101_blind.yaml"
 OPEN = 8
@@ -148,52 +146,56 @@ def percentiles(name: str, seconds: Sequence[float]) -> str:
     return f"{name}: p50 {p50:.1f} ms, p99 {p99:.1f} ms, most {max(seconds) * 1e3:.1f} ms"
 
 
+def measured(
+    runtime: Runtime, count: int, seconds: float, number_of_stops: int
+) -> tuple[list[tuple[Any, Any]], list[tuple[float, float]]]:
+    """What was seen alone and in the flood, as pairs, and the latencies of stops."""
+    session = runtime.session
+    door = next(each for each in runtime.plan.components if isinstance(each, AgentDoor))
+    token = add_token("flood")
+    context = multiprocessing.get_context("spawn")
+    idle, begin, end, calls = *(context.Event() for _ in range(3)), context.Value("i", 0, lock=False)
+    agent = context.Process(target=flood, args=(door.url, token, idle, begin, end, calls))
+    agent.start()
+    pairs = []
+    try:
+        session.watch_states().get(30.0)
+        idle.wait()
+        watch = Watch(session)
+        for number in range(count):
+            calm = watch.during(seconds)
+            before = calls.value
+            begin.set()
+            flooded = watch.during(seconds)
+            made = calls.value - before
+            begin.clear()
+            idle.clear()
+            idle.wait()
+            pairs.append((calm, flooded))
+            print(
+                f"pair {number + 1}: missed {calm[0]} alone, {flooded[0]} in the flood of {made} calls;"
+                f" lateness p99 {calm[1]:.2f} and {flooded[1]:.2f} ms;"
+                f" the run uses {calm[2]:.0%} and {flooded[2]:.0%} of a processor",
+                flush=True,
+            )
+        return pairs, asyncio.run(stops(session, runtime, door.url, token, number_of_stops))
+    finally:
+        end.set()
+        begin.clear()
+        agent.join()
+
+
 def main() -> int:
     """Measure, and print what came of it; 1 if control missed more ticks in the flood, or a stop was late."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--pairs", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--stops", type=int, default=50)
-    parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         os.environ |= {"XDG_RUNTIME_DIR": folder, "XDG_STATE_HOME": folder, "XDG_CONFIG_HOME": folder}
-        runtime = Runtime(Session(robot(), installed_plugins(), LaunchRequest()))
-        session = runtime.session
-        door = next(each for each in runtime.plan.components if isinstance(each, AgentDoor))
-        runtime.start()
-        token = add_token("flood")
-        context = multiprocessing.get_context("spawn")
-        idle, begin, end, calls = *(context.Event() for _ in range(3)), context.Value("i", 0, lock=False)
-        agent = context.Process(target=flood, args=(door.url, token, idle, begin, end, calls))
-        agent.start()
-        pairs = []
-        try:
-            session.watch_states().get(30.0)
-            idle.wait()
-            watch = Watch(session)
-            for number in range(args.pairs):
-                calm = watch.during(args.seconds)
-                before = calls.value
-                begin.set()
-                flooded = watch.during(args.seconds)
-                made = calls.value - before
-                begin.clear()
-                idle.clear()
-                idle.wait()
-                pairs.append((calm, flooded, made))
-                print(
-                    f"pair {number + 1}: missed {calm[0]} alone, {flooded[0]} in the flood of {made} calls;"
-                    f" lateness p99 {calm[1]:.2f} and {flooded[1]:.2f} ms;"
-                    f" the run uses {calm[2]:.0%} and {flooded[2]:.0%} of a processor",
-                    flush=True,
-                )
-            latencies = asyncio.run(stops(session, runtime, door.url, token, args.stops))
-        finally:
-            end.set()
-            begin.clear()
-            agent.join()
-            runtime.stop()
+        with running(robot()) as runtime:
+            pairs, latencies = measured(runtime, args.pairs, args.seconds, args.stops)
     print(percentiles("stop latched", [each[0] for each in latencies]))
     print(percentiles("commands at rest", [each[1] for each in latencies]))
     figures = {
@@ -204,8 +206,6 @@ def main() -> int:
         "stop_p50_ms": float(np.percentile([each[0] for each in latencies], 50)) * 1e3,
         "stop_p99_ms": float(np.percentile([each[0] for each in latencies], 99)) * 1e3,
     }
-    if args.out is not None:
-        args.out.write_text(json.dumps({"pairs": pairs, "latencies": latencies}))
     report(**figures)
     return int(figures["missed_flooded"] > figures["missed_alone"] or figures["stop_p99_ms"] > LATEST_STOP_MS)
 

@@ -1,12 +1,12 @@
-"""Cost of the servo bus's tick for six servos: ours, feetech-servo-sdk's and LeRobot's, against a bare round trip.
+"""Cost of the servo bus's tick for six servos: ours and LeRobot's, against a bare round trip.
 
     python benchmarks/feetech_bus.py
 
 `read` is a sync read of the position; `read+write` adds a sync write of the goals. The servos are a process for each
 client that answers from prepared bytes over a pseudo-terminal, at once or, throttled, after the time that the bytes
-take on a wire at 1 Mbaud. All clients run in turn, in short segments, so that a busy machine slows all. The rows of
-the SDK and of LeRobot need them installed, e.g. `uv pip install 'lerobot[feetech]'`. Exits with 1 when the median of
-`read` exceeds 1.3x that of the bare one, throttled 1.05x, or throttled takes more than a fifth of LeRobot's CPU time.
+take on a wire at 1 Mbaud. All clients run in turn, in short segments, so that a busy machine slows all. LeRobot's row
+needs it installed, e.g. `uv pip install 'lerobot[feetech]'`. Exits with 1 when the median of `read` exceeds 1.3x that
+of the bare one, throttled 1.05x, or throttled takes more than a fifth of LeRobot's CPU time.
 """
 
 from __future__ import annotations
@@ -111,34 +111,6 @@ def ours(port: str, stack: ExitStack) -> Client:
     return read, lambda: writer.write(GOALS)
 
 
-def sdk(port: str, stack: ExitStack) -> Client:
-    import scservo_sdk as scs
-
-    handler = scs.PortHandler(port)
-    handler.openPort()
-    handler.setBaudRate(1_000_000)
-    stack.callback(handler.closePort)
-    packets = scs.PacketHandler(0)
-    reader = scs.GroupSyncRead(handler, packets, 56, 2)
-    writer = scs.GroupSyncWrite(handler, packets, 42, 2)
-    for servo in SERVOS:
-        reader.addParam(servo)
-
-    def read() -> None:
-        if reader.txRxPacket() != scs.COMM_SUCCESS:
-            raise RuntimeError("the SDK got no answer")
-        for servo in SERVOS:
-            reader.getData(servo, 56, 2)
-
-    def write() -> None:
-        writer.clearParam()
-        for servo, goal in zip(SERVOS, GOALS, strict=True):
-            writer.addParam(servo, [scs.SCS_LOBYTE(goal), scs.SCS_HIBYTE(goal)])
-        writer.txPacket()
-
-    return read, write
-
-
 def lerobot(port: str, stack: ExitStack) -> Client:
     from lerobot.motors import Motor, MotorNormMode
     from lerobot.motors.feetech import FeetechMotorsBus
@@ -154,13 +126,7 @@ def lerobot(port: str, stack: ExitStack) -> Client:
     )
 
 
-def available() -> dict[str, Callable[[str, ExitStack], Client]]:
-    found: dict[str, Callable[[str, ExitStack], Client]] = {"bare": bare, "ours": ours}
-    if importlib.util.find_spec("scservo_sdk"):
-        found["sdk"] = sdk
-    if importlib.util.find_spec("lerobot"):
-        found["lerobot"] = lerobot
-    return found
+CLIENTS = {"bare": bare, "ours": ours} | ({"lerobot": lerobot} if importlib.util.find_spec("lerobot") else {})
 
 
 def measure(throttled: bool, rounds: int, calls: int) -> dict[str, Any]:
@@ -168,7 +134,7 @@ def measure(throttled: bool, rounds: int, calls: int) -> dict[str, Any]:
     cpu: dict[tuple[str, str], list[float]] = {}
     with ExitStack() as stack:
         servos = [__file__, "--serve", *(["--throttled"] if throttled else [])]
-        clients = {name: make(stack.enter_context(started(*servos))[1], stack) for name, make in available().items()}
+        clients = {name: make(stack.enter_context(started(*servos))[1], stack) for name, make in CLIENTS.items()}
         for number in in_rounds(rounds + 1):
             for name, (read, write) in clients.items():
                 for what in ("read", "read+write"):
@@ -209,16 +175,14 @@ def main() -> int:
         "throttled": measure(True, arguments.rounds, arguments.calls // 4),
     }
     print(json.dumps(result, indent=2))
-    for missing in {"sdk", "lerobot"} - available().keys():
-        print(f"{missing} is not installed: not measured", file=sys.stderr)
+    if "lerobot" not in CLIENTS:
+        print("LeRobot is not installed: not measured", file=sys.stderr)
     read, wire = result["unthrottled"]["read"], result["throttled"]["read"]
     cpu = {f"{name}_cpu_us": wire[name]["cpu_us"] for name in ("ours", "lerobot") if name in wire}
     report(ratio=read["ours"]["ratio"], ratio_on_the_wire=wire["ours"]["ratio"], **cpu)
-    good = result["unthrottled"]["read"]["ours"]["ratio"] <= LIMIT
-    good &= result["throttled"]["read"]["ours"]["ratio"] <= LIMIT_THROTTLED
-    theirs = result["throttled"]["read"].get("lerobot")
-    if theirs is not None:
-        good &= result["throttled"]["read"]["ours"]["cpu_us"] <= CPU_SHARE * theirs["cpu_us"]
+    good = read["ours"]["ratio"] <= LIMIT and wire["ours"]["ratio"] <= LIMIT_THROTTLED
+    if "lerobot" in wire:
+        good &= wire["ours"]["cpu_us"] <= CPU_SHARE * wire["lerobot"]["cpu_us"]
     return 0 if good else 1
 
 
