@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, override
 
@@ -237,6 +238,9 @@ class _Maker:
         self._plan, self._counts, self._begin = np.empty((0, len(JOINTS))), np.empty(0), 0
         self._command = intended(run, np.zeros(1), self._phase)[0]
         self._state = self._command.copy()
+        t_s, (begin, lasts) = np.arange(int(run.seconds * CONTROL_HZ)) / CONTROL_HZ, run.stall
+        at = np.where(t_s < begin, t_s, np.maximum(begin, t_s - lasts)) if lasts else t_s
+        self._demonstration = np.empty(0) if run.acts else intended(run, at, self._phase)
         self._held = False
         self._waiting, self._side, self._next_ask, self._paused_until = False, 1.0, 0.0, 0.0
 
@@ -322,9 +326,8 @@ class _Maker:
         return self._plan[i] + (t_s * HZ % 1) * (self._plan[min(i + 1, len(self._plan) - 1)] - self._plan[i])
 
     def _demonstrated(self, t_s: float) -> np.ndarray[Any, Any]:
-        run, (begin, lasts) = self.run, self.run.stall
-        at = t_s if t_s < begin or not lasts else max(begin, t_s - lasts)
-        wanted = intended(run, np.array([at]), self._phase)[0]
+        run = self.run
+        wanted = self._demonstration[round(t_s * CONTROL_HZ)].copy()
         wanted += run.shake * self._rng.normal(0, 1, len(JOINTS)) if run.shake else 0.0
         wanted[run.cut[0]] = min(wanted[run.cut[0]], run.cut[1])
         if run.shut:
@@ -379,13 +382,9 @@ def texture(camera: str, margin: int = 24) -> np.ndarray[Any, Any]:
     return _TEXTURES[camera]
 
 
-def draw(
-    camera: str, state: Any, seed: int, rng: np.random.Generator, moved: tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> np.ndarray[Any, Any]:
-    """The picture of a camera: the scene, an object whose place the seed decides, and the arm.
-
-    `moved`: by how much the camera has moved [pixels] and turned [rad].
-    """
+@lru_cache
+def _scene(camera: str, moved: tuple[float, float, float]) -> np.ndarray[Any, Any]:
+    """What a camera sees without the object and the arm."""
     scene = texture(camera)
     height, width = SIZE
     rows, columns = np.mgrid[0:height, 0:width].astype(np.float32)
@@ -393,7 +392,18 @@ def draw(
     c, s = np.cos(moved[2]), np.sin(moved[2])
     at_y = np.clip(np.rint(24 + height / 2 + s * x + c * y + moved[1]), 0, scene.shape[0] - 1).astype(int)
     at_x = np.clip(np.rint(24 + width / 2 + c * x - s * y + moved[0]), 0, scene.shape[1] - 1).astype(int)
-    picture = scene[at_y, at_x].copy()
+    return scene[at_y, at_x]
+
+
+def draw(
+    camera: str, state: Any, seed: int, rng: np.random.Generator, moved: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> np.ndarray[Any, Any]:
+    """The picture of a camera: the scene, an object whose place the seed decides, and the arm.
+
+    `moved`: by how much the camera has moved [pixels] and turned [rad].
+    """
+    picture = _scene(camera, moved).copy()
+    height, width = SIZE
     place = np.random.default_rng(seed + 7).uniform(0.3, 0.7, 2)
     oy, ox = int(place[0] * height - moved[1]), int(place[1] * width - moved[0])
     picture[max(0, oy - 4) : oy + 4, max(0, ox - 4) : ox + 4] = (220, 30, 30)

@@ -87,10 +87,9 @@ def _blurred(values: Grey, radius: int) -> Grey:
     """Mean of squares around each pixel."""
     for axis in (0, 1):
         padded = np.pad(values, [(radius + 1, radius) if i == axis else (0, 0) for i in (0, 1)], mode="edge")
-        sums = np.cumsum(padded, axis=axis, dtype=np.float64)
-        high = np.take(sums, range(2 * radius + 1, sums.shape[axis]), axis)
-        low = np.take(sums, range(sums.shape[axis] - 2 * radius - 1), axis)
-        values = ((high - low) / (2 * radius + 1)).astype(np.float32)
+        sums = np.cumsum(padded, axis=axis, dtype=np.float64).swapaxes(0, axis)
+        means = (sums[2 * radius + 1 :] - sums[: -2 * radius - 1]) / (2 * radius + 1)
+        values = means.swapaxes(0, axis).astype(np.float32)
     return values
 
 

@@ -105,7 +105,8 @@ def small_of(picture: NDArray[np.uint8], digest: bytes = b"") -> Picture:
     laplacian = values[:-2, 1:-1] + values[2:, 1:-1] + values[1:-1, :-2] + values[1:-1, 2:] - 4 * inner
     sharpness = float(laplacian.std()) / max(contrast, 1.0) if inner.size else 0.0
     small = resized(middle, SMALL).round().astype(np.uint8)
-    clipped = float((middle.min(axis=2) >= 250).mean())
+    red, green, blue = np.moveaxis(middle, 2, 0)
+    clipped = float(((red >= 250) & (green >= 250) & (blue >= 250)).mean())
     return Picture(digest, small, float(values.mean()), contrast, sharpness, clipped)
 
 

@@ -141,7 +141,7 @@ def test_stiff_arm_of_the_mjcf_is_simulated_as_it_is_and_has_no_weak_joint(tmp_p
     hardware = MujocoHardware(options, control_context("sim", robot=ROBOT, period_ns=TICK_NS))
     hardware.connect()
     hardware.reset(EpisodeSetup(0))
-    stiff = identify(OPTIONS, ROBOT, [recorded(hardware, moves(12.0))])
+    stiff = identify(OPTIONS, ROBOT, [recorded(hardware, moves(8.0))])
     assert np.rad2deg(stiff.totals["before"]) < 0.15
     assert stiff.totals["after"] > 2 * stiff.totals["before"]
     assert not [each for each in stiff.findings if each.kind in ("weak", "stiff")]

@@ -578,13 +578,13 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize("message", WRONG, ids=range(len(WRONG)))
-def test_a_malformed_change_is_refused_and_changes_nothing(tmp_path, message) -> None:
+def test_malformed_changes_are_refused_and_change_nothing(tmp_path) -> None:
     loop = Loop(tmp_path, LEFT)
     loop.world(WALL)
-    with pytest.raises(HardwareError, match="change of the world"):
-        loop.guard.world(message)
-    assert loop.go(ACROSS)[0] > 0
+    for message in WRONG:
+        with pytest.raises(HardwareError, match="change of the world"):
+            loop.guard.world(message)
+    assert 0 < loop.go(ACROSS)[0] < LEFT[0] - 0.3, "the arm moves up to the wall, and not through it"
 
 
 @pytest.mark.parametrize(("name", "link"), [("hand", None), ("stick", "nowhere")])

@@ -54,11 +54,12 @@ MESHES = {
 
 
 def outside(boxes: Boxes, points: Vector) -> float:
-    """How far points, shape (N, 3), are outside of the box in which each is deepest, at most [m]."""
+    """How far points, shape (N, 3), are outside of all boxes, at most [m]; not positive if all are inside."""
     axes, middles = boxes.placements[:, 1:], boxes.placements[:, 0]
     best = np.full(len(points), np.inf)
     for axis, middle, size in zip(axes, middles, boxes.sizes, strict=True):
-        best = np.minimum(best, (np.abs((points - middle) @ axis.T) - size / 2).max(axis=1))
+        left = best > 0  # in no box yet
+        best[left] = np.minimum(best[left], (np.abs((points[left] - middle) @ axis.T) - size / 2).max(axis=1))
     return float(best.max())
 
 
