@@ -98,7 +98,7 @@ def test_rates_are_the_derivatives(arm, given_: PathConstraints, where):
 def test_projections_keep_the_constraints_and_the_limits(arm, given_: PathConstraints, seed: int):
     path, model = arm
     tool = ToolConstraints(given_, model, bent(model))
-    q = np.random.default_rng(seed).uniform(model.lower, model.upper, (20, len(model.lower)))
+    q = np.random.default_rng(seed).uniform(model.lower, model.upper, (8, len(model.lower)))
     near, done = tool.projected(q)
     kept = tool.kept(q)
     np.testing.assert_array_equal(near[kept], q[kept])

@@ -116,7 +116,7 @@ def test_damaged_order_is_an_error(tmp_path):
 
 
 @pytest.mark.parametrize("difference", [0.2, 0.3])
-@pytest.mark.parametrize("policies", range(2, 11))
+@pytest.mark.parametrize("policies", [2, 3, 10])
 def test_stated_numbers_of_trials_have_a_power_of_80_percent(policies, difference):
     number = trials_needed(difference, policies)
     assert number is not None

@@ -555,7 +555,7 @@ def written(shape: Any, at: float = 0.0, turn: tuple[int, ...] = (0, 0, 0, 1)) -
     return {"changed": {"it": {"shape": shape, "pose": [at, 0, 0, *turn], "link": None, "may_touch": []}}}
 
 
-WRONG = [
+WRONG: list[Any] = [
     {"changed": {"it": None}},
     {"changed": []},
     {"removed": 3},
