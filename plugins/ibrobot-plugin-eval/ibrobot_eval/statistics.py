@@ -182,8 +182,8 @@ def drift(outcomes: Iterable[Sequence[bool]], shuffles: int = _SHUFFLES) -> floa
 
 
 @cache
-def _bets() -> tuple[Array, Array]:
-    """Stake of each bet in the mixture, as a fraction of the capital, and the logarithm of its weight.
+def _bets() -> tuple[Array, Array, Array]:
+    """Stake of each bet in the mixture, as a fraction of the capital, and the logarithms of its weight and its loss.
 
     Stakes follow a Beta(2, 2) distribution, which needs the fewest episodes over a range of differences.
     Any weights that do not depend on the outcomes are valid.
@@ -191,7 +191,7 @@ def _bets() -> tuple[Array, Array]:
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     stakes = (nodes + 1) / 2
     density = weights * stakes * (1 - stakes)
-    return stakes, np.log(density / density.sum())
+    return stakes, np.log(density / density.sum()), np.log1p(-stakes)
 
 
 def _log_mean(exponents: Array) -> float:
@@ -213,9 +213,8 @@ def log_capital(first: float, second: float, same: float, difference: float) -> 
         same: number of the others.
         difference: the supposed difference, between -1 and 1.
     """
-    stakes, weights = _bets()
+    stakes, weights, lost = _bets()
     mean = (1 + difference) / 2
-    lost = np.log1p(-stakes)
 
     def side(mean: float, won: float, not_won: float) -> float:
         gain = np.log1p(stakes * (1 / mean - 1))
@@ -275,17 +274,15 @@ class PairedTest:
         return Interval(self._end(middle, low), self._end(middle, high))
 
     def _end(self, inside: float, end: float) -> float:
-        outside = min(max(end, _EDGE - 1), 1 - _EDGE)
-        nearer = outside + math.copysign(min(_TOLERANCE, abs(inside - outside)), inside - outside)
-        if abs(inside - outside) <= _TOLERANCE or not self._refuted(nearer):
+        from scipy.optimize import brentq
+
+        inside, outside = (min(max(each, _EDGE - 1), 1 - _EDGE) for each in (inside, end))
+        outwards = math.copysign(_TOLERANCE, outside - inside)
+        if abs(inside - outside) <= _TOLERANCE or not self._refuted(outside - outwards):
             return end
-        while abs(outside - inside) > _TOLERANCE:
-            middle = (inside + outside) / 2
-            if self._refuted(middle):
-                outside = middle
-            else:
-                inside = middle
-        return outside
+        limit = self._log_limit
+        edge = brentq(lambda each: self._log_capital(each) - limit, inside, outside - outwards, xtol=_TOLERANCE / 4)
+        return float(edge) + outwards / 2  # refuted, whatever the rounding
 
 
 def episodes_to_decide(pairs: Pairs, margin: float, alpha: float = ALPHA) -> int | None:
