@@ -29,8 +29,7 @@ from ibrobot_core.contract.specs import Contract
 from ibrobot_core.control.commands import GetCounters
 from ibrobot_core.control.host import InlineControl
 from ibrobot_core.dispatch.dispatcher import Dispatcher
-from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient, run_policy
-from ibrobot_core.inference.engine import LocalEngine
+from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient, LocalEngine, run_policy
 from ibrobot_core.interfaces import Policy
 from ibrobot_core.interfaces.run_state import ControlState, PlanRecord
 from ibrobot_core.messages import Header, JointState

@@ -62,7 +62,7 @@ from ibrobot_core.interfaces.hardware import (
     Severity as Severity,
     nan_vector as nan_vector,
 )
-from ibrobot_core.contract.vectors import ACTION as ACTION
+from ibrobot_core.interfaces.policy import ACTION as ACTION
 from ibrobot_core.deadman import Deadman as Deadman
 
 # Models

@@ -85,7 +85,7 @@ from ibrobot_core.selection import (
     JointFeature as JointFeature,
 )
 from ibrobot_core.contract.specs import SignalPart as SignalPart, joint_selection as joint_selection
-from ibrobot_core.contract.vectors import PolicyVectors as PolicyVectors
+from ibrobot_core.interfaces.policy import PolicyVectors as PolicyVectors
 from ibrobot_core.units import NORM_MODES as NORM_MODES
 
 # Commands

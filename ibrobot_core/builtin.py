@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def _monolithic(options: Any, ctx: Context) -> Engine:
-    from ibrobot_core.inference.engine import LocalEngine
+    from ibrobot_core.inference.client import LocalEngine
 
     assert ctx.model is not None
     return LocalEngine(ctx.model.policy)

@@ -11,12 +11,11 @@ import numpy as np
 from ibrobot_core.bus import Bus
 from ibrobot_core.contract.frames import FrameSampler
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.contract.vectors import PolicyVectors
 from ibrobot_core.dispatch.latency import LatencyEstimate
 from ibrobot_core.dispatch.smoother import LeadIn, TemporalSmoother
 from ibrobot_core.errors import ContractError
 from ibrobot_core.inference.client import Chunk, DispatchInfer, InferenceClient
-from ibrobot_core.interfaces import Frame, PolicySpec
+from ibrobot_core.interfaces import Frame, PolicySpec, PolicyVectors
 from ibrobot_core.interfaces.run_state import DispatchStats
 from ibrobot_core.robot import Robot, Vector
 from ibrobot_core.schema import DispatchConfig

@@ -1,4 +1,4 @@
-"""Inference clients: turn a frame into a chunk of actions, wherever the model runs."""
+"""Inference clients: turn a frame into a chunk of actions, wherever the model runs; and the engine in this process."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ import attrs
 import numpy as np
 
 from ibrobot_core.errors import PolicyError
-from ibrobot_core.inference.engine import LocalEngine
-from ibrobot_core.interfaces import Engine, Frame, Policy
+from ibrobot_core.interfaces import Engine, Frame, Policy, Tensors
 from ibrobot_core.robot import Vector
 from ibrobot_core.units import ns
 
@@ -45,6 +44,29 @@ class Chunk:
     """Time that the request spent queued behind other robots [ns]."""
     pace_ns: int = 0
     """Minimum time between requests, set by the server [ns]; 0 for no minimum."""
+
+
+class LocalEngine(Engine):
+    """The engine `monolithic`: calls the policy in this process; the policy's owner resets and closes it."""
+
+    def __init__(self, policy: Policy) -> None:
+        super().__init__("monolithic")
+        self._policy = policy
+
+    @override
+    def start(self) -> None:
+        self._policy.load()
+        self._identify()
+        self.stats.alive = True
+
+    @override
+    def run(self, tensors: Tensors, request_id: int, deadline_ns: int) -> Tensors:
+        outputs = self._policy.infer(tensors)
+        self._identify()  # a policy on a server may have connected to another one
+        return outputs
+
+    def _identify(self) -> None:
+        self.stats.weights, self.stats.server = self._policy.weights(), self._policy.identity()
 
 
 class InferenceClient(ABC):

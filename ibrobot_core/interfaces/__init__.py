@@ -14,7 +14,7 @@ from ibrobot_core.interfaces.hardware import (
     SimulatedHardware,
     Torque,
 )
-from ibrobot_core.interfaces.policy import Frame, PictureCodec, Policy, PolicySpec, Tensors
+from ibrobot_core.interfaces.policy import Frame, PictureCodec, Policy, PolicySpec, PolicyVectors, Tensors
 from ibrobot_core.interfaces.reader import EpisodeAddress, EpisodeReader
 from ibrobot_core.interfaces.recorder import EpisodeEnd, EpisodeStart, Recorder
 from ibrobot_core.interfaces.sensor import Sensor

@@ -17,6 +17,8 @@ from ibrobot_core.errors import PolicyError
 from ibrobot_core.robot import Vector
 
 Tensors = Mapping[str, NDArray[np.generic]]
+ACTION = "action"
+"""Key of the action vector."""
 
 
 @attrs.frozen(eq=False)
@@ -245,3 +247,35 @@ class Policy(ABC):
 
     def close(self) -> None:
         """Release memory and devices. Safe to call twice."""
+
+
+class PolicyVectors:
+    """Converts observations and actions between the robot and a policy. This class changes nothing: all in radians."""
+
+    needs: tuple[str, ...] = ()
+    """Keys of observations that `commands` needs, whatever the policy reads."""
+
+    def __call__(self, values: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """Convert values of a tick from radians to the unit; joints on the last axis. Copies arrays that change."""
+        return dict(values)
+
+    def frame(self, frame: Frame) -> Frame:
+        """Convert a frame with its history and prefix to the unit."""
+        return frame
+
+    def commands(self, actions: Vector, seen: Mapping[str, NDArray[Any]], start: Vector) -> tuple[Vector, int]:
+        """The positions of the joints [rad], shape (N, A), that actions of a policy command, and how many it held.
+
+        Args:
+            actions: in the policy's units, shape (N, F).
+            seen: the observations for which the policy gave them, in radians.
+            start: the joints' commands before them [rad], shape (A,).
+        """
+        return self.radians(ACTION, actions), 0
+
+    def check(self, spec: PolicySpec) -> None:
+        """Raise ContractError if a policy cannot give actions of this form; any can give positions of joints."""
+
+    def radians(self, key: str, value: NDArray[Any]) -> NDArray[Any]:
+        """Convert the vectors of one key from the unit to radians; joints on the last axis."""
+        return value

@@ -9,10 +9,9 @@ from contextlib import closing
 from ibrobot_core.config import RobotConfig
 from ibrobot_core.contract.check import check_policy
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.contract.vectors import PolicyVectors
 from ibrobot_core.dispatch.dispatcher import check_strategy
 from ibrobot_core.errors import ConfigError, ContractError, IbrobotError, Problem
-from ibrobot_core.interfaces import PolicySpec
+from ibrobot_core.interfaces import PolicySpec, PolicyVectors
 from ibrobot_core.interfaces.run import Plugins
 from ibrobot_core.plugins import installed_plugins
 from ibrobot_core.schema import ModelConfig

@@ -15,8 +15,14 @@ from ibrobot_testing.fakes import FakePolicy
 
 from ibrobot_core.errors import PolicyError
 from ibrobot_core.inference import client as module
-from ibrobot_core.inference.client import Chunk, DispatchInfer, EngineClient, InferenceClient, LockstepClient
-from ibrobot_core.inference.engine import LocalEngine
+from ibrobot_core.inference.client import (
+    Chunk,
+    DispatchInfer,
+    EngineClient,
+    InferenceClient,
+    LocalEngine,
+    LockstepClient,
+)
 from ibrobot_core.interfaces import Frame
 
 PATIENCE_S = 30.0

@@ -22,7 +22,7 @@ from ibrobot_testing.contexts import START_NS, host_context
 from ibrobot_testing.fakes import FakeTransport
 
 from ibrobot_core.config import load_config
-from ibrobot_core.inference.engine import LocalEngine
+from ibrobot_core.inference.client import LocalEngine
 from ibrobot_core.interfaces import Engine, Frame, Payload
 
 sys.path.insert(0, str(Path(__file__).parent))

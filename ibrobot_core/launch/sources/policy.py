@@ -11,11 +11,11 @@ import numpy as np
 
 from ibrobot_core.component import Component, SourceWorker, TransportLink
 from ibrobot_core.contract.specs import Contract
-from ibrobot_core.contract.vectors import ACTION, PolicyVectors
 from ibrobot_core.dispatch.dispatcher import Dispatcher
 from ibrobot_core.errors import wrong_input
 from ibrobot_core.inference.client import Chunk, EngineClient, InferenceClient, LockstepClient
-from ibrobot_core.interfaces import Engine, ModelContext, Policy
+from ibrobot_core.interfaces import Engine, ModelContext, Policy, PolicyVectors
+from ibrobot_core.interfaces.policy import ACTION
 from ibrobot_core.interfaces.run_state import ActingPolicy, DispatchStats
 from ibrobot_core.launch.models import check_model
 from ibrobot_core.launch.session import Session

@@ -344,13 +344,15 @@ class GoalDoor(SessionWorker):
         return dict(zip(self._robot.joint_names, command.tolist(), strict=True))
 
     def _check_granted(self, trajectory: JointTrajectory) -> None:
-        """Check a trajectory against what is granted to an agent.
+        """Check a trajectory against what is granted to an agent, if anything is.
 
         Raises:
             HardwareError: if it goes beyond that.
         """
-        motion, robot, authority = motion_of(trajectory), self._robot, self.session.authority
-        if motion is None:  # nobody has completed it
+        authority, robot = self.session.authority, self._robot
+        if authority.grant is None:
+            return
+        if (motion := motion_of(trajectory)) is None:  # nobody has completed it
             authority.check_path(np.empty((0, len(robot.joints))), math.inf)
             return
         columns = robot.indices(trajectory.joint_names)
@@ -360,11 +362,13 @@ class GoalDoor(SessionWorker):
         authority.check_path(whole, float((np.abs(velocities) / robot.max_velocity[columns]).max()))
 
     def _check_joint_granted(self, executor: str, position: float) -> None:
-        """Check the way of a joint to a position [rad] against what is granted to an agent.
+        """Check the way of a joint to a position [rad] against what is granted to an agent, if anything is.
 
         Raises:
             HardwareError: if it goes beyond that.
         """
+        if self.session.authority.grant is None:
+            return
         robot, others = self._robot, self._others()
         here = np.array([others[name] for name in robot.joint_names])
         there = here.copy()
