@@ -125,6 +125,20 @@ def test_interval_only_narrows_and_excludes_zero_exactly_when_the_test_rejects(o
     assert away > -1e-5 if test.p_value <= ALPHA else away < 1e-5
 
 
+@given(st.lists(st.tuples(st.booleans(), st.booleans()), max_size=80))
+def test_ends_of_the_interval_are_refuted_and_what_is_a_millionth_nearer_is_not(outcomes):
+    test, limit = PairedTest(), -np.log(ALPHA)
+    for first, second in outcomes:
+        before = test.interval
+        test.add(first, second)
+        counts = test.pairs.first, test.pairs.second, test.pairs.same
+        for end, old, inwards in (
+            (test.interval.low, before.low, 1e-6), (test.interval.high, before.high, -1e-6)
+        ):  # fmt: skip
+            if end != old:
+                assert log_capital(*counts, end) >= limit > log_capital(*counts, end + inwards)
+
+
 def test_test_counts_its_pairs():
     outcomes = [(True, False)] * 9 + [(False, True)] + [(True, True)] * 5
     test = PairedTest()
