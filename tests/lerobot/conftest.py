@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
+import logging
 import select
+import signal
+import sys
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,6 +18,25 @@ collect_ignore_glob = [] if find_spec("lerobot") else ["test_*.py"]
 
 _GLANCE_S = 0.01
 _PATIENCE_MS = 3000
+
+
+@pytest.fixture
+def lerobot_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+    """Runs a command of LeRobot in this process, which has torch already."""
+
+    def run(name: str, *arguments: str) -> None:
+        monkeypatch.setattr(sys, "argv", [f"lerobot-{name}", *arguments])
+        importlib.import_module(f"lerobot.scripts.lerobot_{name}").main()
+
+    monkeypatch.setattr("tqdm.tqdm.monitor_interval", 0)  # no thread of tqdm's
+    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path / "home"))
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    root = logging.getLogger()
+    before = root.handlers[:], root.level
+    yield run
+    root.handlers[:], root.level = before
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture

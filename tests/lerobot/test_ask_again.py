@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from safetensors.torch import load_file, save_file
 from ibrobot_core.app import installed_plugins
 
 sys.path.insert(0, str(Path(__file__).parent))
-from checkpoints import CONFIGS, SCENE, STATE, TOP, act, diffusion, features, save, statistics
+from checkpoints import EVERYWHERE, SCENE, STATE, TOP, act, diffusion, features, save, statistics, vqbet
 from command_line import run_here
 
 pytestmark = pytest.mark.lerobot
@@ -43,10 +43,10 @@ OBSERVED = "".join(
 )
 NOT_ALL_SUCCEEDED = 3
 MODES = ("monolithic", "process", "distributed")
-KINDS = {
-    "act": lambda: act(**features(STATE, TOP, "observation.images.wrist")),
+KINDS: dict[str, Callable[..., Any]] = {
+    "act": partial(act, **features(STATE, TOP, "observation.images.wrist")),
     "diffusion": diffusion,
-    "vqbet": CONFIGS["vqbet"],
+    "vqbet": vqbet,
 }
 """Each sees pictures."""
 _DURATION_S = {"blind": 2}
@@ -86,15 +86,20 @@ def served(checkpoint: Path) -> Iterator[str]:
         server.communicate(timeout=60)
 
 
+def checkpoint_of(root: Path, kind: str, mode: str) -> Path:
+    """The checkpoint of a kind of policy; one that another process can load too, unless this one runs it."""
+    path = root / (kind if mode == "monolithic" else f"{kind}-everywhere")
+    return path if path.exists() else save(KINDS[kind](**({} if mode == "monolithic" else EVERYWHERE)), path)
+
+
 def record(root: Path, kind: str, mode: str, endpoint: str = "") -> Path:
     """A run of a kind of policy with an execution mode, recorded."""
-    checkpoint = root / kind if (root / kind).exists() else save(KINDS[kind](), root / kind)
     network = ("--set", f"transport={{type: zenoh, connect: [{endpoint}]}}") if endpoint else ()
     done = run_here(
         "launch", robot(root / "cube.yaml"), "--sim", "--headless", "--lockstep", "--episodes", 1,
         "--mode", "learned", "--set", f"contract.max_duration_s={_DURATION_S.get(kind, 0.2)}",
         "--set", "models.act.threads=1",
-        "--set", f"models.act.path={checkpoint}", "--set", f"recording.root={root / kind}-{mode}",
+        "--set", f"models.act.path={checkpoint_of(root, kind, mode)}", "--set", f"recording.root={root / kind}-{mode}",
         "--set", "recording.type=mcap",
         "--set", f"control_modes.learned.inference.execution_mode={mode}", *network,
     )  # fmt: skip
@@ -120,8 +125,7 @@ def answered(request: pytest.FixtureRequest, root: Path, recorded: Callable[[str
     elif mode == "process":
         yield record(root, kind, mode), ""
     else:
-        checkpoint = root / kind if (root / kind).exists() else save(KINDS[kind](), root / kind)
-        with served(checkpoint) as endpoint:
+        with served(checkpoint_of(root, kind, mode)) as endpoint:
             yield record(root, kind, mode, endpoint), endpoint
 
 

@@ -37,16 +37,23 @@ PATIENCE_S = 30.0
 TORCH = Version("0.5") > LEROBOT
 """Whether LeRobot's devices call torch, and do not only import it."""
 PATIENT = """
+import select
 import lerobot.motors.feetech.feetech as bus
 from dataclasses import dataclass
 from lerobot.robots import RobotConfig
 from lerobot.robots.so_follower import SOFollower, SOFollowerRobotConfig
+from scservo_sdk.port_handler import PortHandler
 
 def wait(port, packet_length):
     port.packet_start_time = port.getCurrentTime()
     port.packet_timeout = 3000
 
+def read(port, length):
+    select.select([port.ser], [], [], 0.01)
+    return bytes(port.ser.read(length))
+
 bus.patch_setPacketTimeout = wait
+PortHandler.readPort = read
 
 @RobotConfig.register_subclass("patient_so101")
 @dataclass

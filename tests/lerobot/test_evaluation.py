@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from ibrobot_testing import ibrobot_command
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.act.configuration_act import ACTConfig
 
@@ -19,6 +18,7 @@ from ibrobot_core.app import installed_plugins
 
 sys.path.insert(0, str(Path(__file__).parent))
 from checkpoints import SCENE, SIZE, STATE, save
+from command_line import run_here
 
 pytestmark = pytest.mark.lerobot
 EPISODES, SEED = 4, 3
@@ -56,33 +56,37 @@ def ours(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     settings = ("simulation.scene=push", *OVERRIDES, model, dispatch)
     sets = [word for each in settings for word in ("--set", each)]
     counts = ("--episodes", str(EPISODES), "--seed", str(SEED), "--jobs", "1", "--videos", "0")
-    command = (*ibrobot_command(), "eval", "so101_scenes", "--sim", "--mode", "push", *sets, *counts, "--out", str(out))
-    subprocess.run(command, check=True, capture_output=True)
-    return out
-
-
-def lerobot_eval(checkpoint: Path, out: Path, episodes: int, seed: int, *more: str) -> Path:
-    """Run LeRobot's command; returns its folder."""
-    command = (
-        str(Path(sys.executable).with_name("lerobot-eval")),
-        f"--policy.path={checkpoint}",
-        "--policy.device=cpu",
-        "--env.type=ibrobot",
-        "--env.task=Push-v0",
-        f"--env.overrides={json.dumps(OVERRIDES)}",
-        f"--eval.n_episodes={episodes}",
-        "--eval.batch_size=1",
-        f"--seed={seed}",
-        f"--output_dir={out}",
-        *more,
-    )
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    done = run_here("eval", "so101_scenes", "--sim", "--mode", "push", *sets, *counts, "--out", out)
     assert done.returncode == 0, done.stderr
     return out
 
 
-def test_successes_are_equal_seed_by_seed(checkpoint: Path, ours: Path, tmp_path: Path) -> None:
-    theirs = json.loads((lerobot_eval(checkpoint, tmp_path / "theirs", EPISODES, SEED) / "eval_info.json").read_text())
+@pytest.fixture
+def lerobot_eval(checkpoint: Path, lerobot_command: Callable[..., None], tmp_path: Path) -> Callable[..., Path]:
+    """Runs LeRobot's command; returns its folder."""
+
+    def run(episodes: int, seed: int, *more: str) -> Path:
+        out = tmp_path / "theirs"
+        lerobot_command(
+            "eval",
+            f"--policy.path={checkpoint}",
+            "--policy.device=cpu",
+            "--env.type=ibrobot",
+            "--env.task=Push-v0",
+            f"--env.overrides={json.dumps(OVERRIDES)}",
+            f"--eval.n_episodes={episodes}",
+            "--eval.batch_size=1",
+            f"--seed={seed}",
+            f"--output_dir={out}",
+            *more,
+        )
+        return out
+
+    return run
+
+
+def test_successes_are_equal_seed_by_seed(ours: Path, lerobot_eval: Callable[..., Path]) -> None:
+    theirs = json.loads((lerobot_eval(EPISODES, SEED) / "eval_info.json").read_text())
     (task,) = theirs["per_task"]
     episodes = json.loads((ours / "report.json").read_text())["episodes"]
     outcomes = [each["success"] for each in episodes]
@@ -92,10 +96,10 @@ def test_successes_are_equal_seed_by_seed(checkpoint: Path, ours: Path, tmp_path
 
 
 @pytest.mark.long
-def test_observations_are_equal_bit_by_bit(checkpoint: Path, ours: Path, tmp_path: Path) -> None:
+def test_observations_are_equal_bit_by_bit(ours: Path, lerobot_eval: Callable[..., Path]) -> None:
     episodes = json.loads((ours / "report.json").read_text())["episodes"]
     seed = next(each["seed"] for each in episodes if not each["success"])  # a success ends its episode at once
-    out = lerobot_eval(checkpoint, tmp_path / "theirs", 1, seed, "--eval.recording=true")
+    out = lerobot_eval(1, seed, "--eval.recording=true")
     rows = pq.read_table(next(out.rglob("data/**/*.parquet")))
     state, scene = (np.stack(rows[name].to_numpy()) for name in ("agent_pos", "environment_state"))
     reader = installed_plugins().open_episode(ours / "episodes" / "push" / f"seed_{seed:06d}")

@@ -26,7 +26,7 @@ from ibrobot_core.inference.client import LocalEngine
 from ibrobot_core.interfaces import Engine, Frame, Payload
 
 sys.path.insert(0, str(Path(__file__).parent))
-from checkpoints import CONFIGS, Theirs, save
+from checkpoints import CONFIGS, EVERYWHERE, Theirs, save
 
 pytestmark = pytest.mark.lerobot
 
@@ -47,7 +47,7 @@ default_control_mode: idle
 
 @pytest.fixture(params=["act", pytest.param("diffusion", marks=pytest.mark.long)])
 def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    return save(CONFIGS[request.param](), tmp_path / request.param)
+    return save(CONFIGS[request.param](**EVERYWHERE), tmp_path / request.param)
 
 
 class Counting(FakeTransport):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
-from checkpoints import act, save, statistics
+from checkpoints import EVERYWHERE, act, save, statistics
 
 pytestmark = [pytest.mark.lerobot, pytest.mark.long]
 
@@ -21,7 +21,7 @@ def test_table_has_each_precision_and_number_of_requests(tmp_path: Path) -> None
     stats = statistics()
     for each in stats.values():
         each["std"][:] = 0.3  # what never changed would become too large for float16
-    policy = str(save(act(), tmp_path / "act", stats))
+    policy = str(save(act(**EVERYWHERE), tmp_path / "act", stats))
     command = [sys.executable, str(PROGRAM), policy, "--device", "cpu", "--at-once", "1", "2", "--rounds", "2"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

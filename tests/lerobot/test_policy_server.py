@@ -1,22 +1,23 @@
-"""LeRobot's own policy server, in its process: our chunks are those of LeRobot's own client, bit for bit."""
+"""LeRobot's own policy server: our chunks are those of LeRobot's own client, bit for bit."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
 import logging
-import os
 import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import attrs
+import grpc
 import numpy as np
 import pytest
 import torch
@@ -33,7 +34,7 @@ from ibrobot_core.errors import PolicyError
 from ibrobot_core.interfaces import Frame
 
 sys.path.insert(0, str(Path(__file__).parent))
-from checkpoints import CHUNK, STATE, TOP, WRIST, act, features, save
+from checkpoints import CHUNK, EVERYWHERE, STATE, TOP, WRIST, act, features, save
 
 pytestmark = pytest.mark.lerobot
 
@@ -41,6 +42,8 @@ JOINTS = ARM + GRIPPER
 IMAGE, LARGE = (96, 96, 3), (120, 160, 3)
 """The large one is resized by the server."""
 PATIENCE_S = 300.0
+THREADS = 4
+"""Of LeRobot's server, for requests."""
 
 
 @pytest.fixture(scope="module")
@@ -48,33 +51,56 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save(act(**features(STATE, TOP, WRIST)), tmp_path_factory.mktemp("checkpoint") / "act")
 
 
+def imported(name: str, folder: Path) -> ModuleType:
+    """A module of LeRobot's server or client, which opens a log file and changes all logging when it is imported."""
+    root = logging.getLogger()
+    before, level = list(root.handlers), root.level
+    with contextlib.chdir(folder):
+        module = importlib.import_module(f"lerobot.async_inference.{name}")
+    for handler in root.handlers:
+        if handler not in before:
+            handler.close()
+    root.handlers[:] = before
+    root.setLevel(level)
+    return module
+
+
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """LeRobot's server."""
+    """LeRobot's server, in this process, which has torch already; all its threads run before a test begins."""
+    module = imported("policy_server", tmp_path_factory.mktemp("server"))
     with contextlib.closing(socket.create_server(("127.0.0.1", 0))) as free:
         port = free.getsockname()[1]
-    options = (f"--port={port}", "--host=127.0.0.1", "--inference_latency=0", "--obs_queue_timeout=0.2")
-    command = (sys.executable, "-m", "lerobot.async_inference.policy_server", *options)
-    folder = tmp_path_factory.mktemp("server")  # its logs are written there
-    with (folder / "out").open("wb") as out:
-        threads = os.environ | {"OMP_NUM_THREADS": "1"}
-        process = subprocess.Popen(command, cwd=folder, stdout=out, stderr=out, env=threads)
+    config = module.PolicyServerConfig(host="127.0.0.1", port=port, inference_latency=0.0, obs_queue_timeout=0.2)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    pool, begun = ThreadPoolExecutor(THREADS), threading.Barrier(THREADS + 1)
+    for _ in range(THREADS):
+        pool.submit(begun.wait)
+    begun.wait()
+    server = grpc.server(pool)
+    with pytest.MonkeyPatch.context() as patches:
+        patches.setattr(grpc, "server", lambda executor: server)
+        serving = threading.Thread(target=module.serve, args=(config,))
+        serving.start()
         try:
-            until_it_listens(port, process, folder / "out")
+            until_it_listens(port, serving)
             yield f"127.0.0.1:{port}"
         finally:
-            process.kill()
-            process.wait()
+            server.stop(0).wait()
+            serving.join()
+            pool.shutdown()
+            torch.set_num_threads(threads)
 
 
-def until_it_listens(port: int, process: subprocess.Popen[bytes], out: Path) -> None:
+def until_it_listens(port: int, serving: threading.Thread) -> None:
     deadline_s = time.monotonic() + PATIENCE_S
     while True:
         try:
             return socket.create_connection(("127.0.0.1", port)).close()
         except ConnectionRefusedError:
-            assert process.poll() is None, out.read_text()
-            assert time.monotonic() < deadline_s, out.read_text()
+            assert serving.is_alive()
+            assert time.monotonic() < deadline_s
             time.sleep(0.05)
 
 
@@ -122,17 +148,8 @@ def seen(count: int) -> list[dict[str, NDArray[Any]]]:
 
 @pytest.fixture(scope="module")
 def robot_client(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
-    """The module of LeRobot's client, which opens a log file and changes all logging when it is imported."""
-    root = logging.getLogger()
-    before, level = list(root.handlers), root.level
-    with contextlib.chdir(tmp_path_factory.mktemp("client")):
-        module = importlib.import_module("lerobot.async_inference.robot_client")
-    for handler in root.handlers:
-        if handler not in before:
-            handler.close()
-    root.handlers[:] = before
-    root.setLevel(level)
-    return module
+    """The module of LeRobot's client."""
+    return imported("robot_client", tmp_path_factory.mktemp("client"))
 
 
 class Robot:
@@ -241,7 +258,7 @@ def test_the_simulated_robot_moves_as_with_the_model_in_its_own_process(address:
     inputs["input_features"][TOP] = PolicyFeature(FeatureType.VISUAL, (3, 240, 320))
     joints = {"mean": np.array([0, -1.3, 1.2, 0.8, 0, 0.3], np.float32), "std": np.full(len(JOINTS), 0.3, np.float32)}
     colours = {"mean": np.full((3, 1, 1), 0.4, np.float32), "std": np.full((3, 1, 1), 0.2, np.float32)}
-    path = save(act(**inputs), tmp_path / "act", {STATE: joints, "action": joints, TOP: colours})
+    path = save(act(**inputs, **EVERYWHERE), tmp_path / "act", {STATE: joints, "action": joints, TOP: colours})
     mapping = (
         f"observations: [{{observation: {STATE}, key: [{STATE}], shape: [6]}}, "
         f"{{observation: {TOP}, key: [{TOP}], shape: [240, 320, 3]}}], actions: [{{joints: [{', '.join(JOINTS)}]}}]"

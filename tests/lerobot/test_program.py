@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-import logging
 import os
 import signal
 import sys
@@ -43,25 +41,14 @@ WAVING = (
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
-    """Runs a command of LeRobot in this process, which has torch already."""
-
-    def command(name: str, *arguments: str) -> None:
-        monkeypatch.setattr(sys, "argv", [f"lerobot-{name}", *arguments])
-        importlib.import_module(f"lerobot.scripts.lerobot_{name}").main()
-
-    monkeypatch.setattr("tqdm.tqdm.monitor_interval", 0)  # no thread of tqdm's
-    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path / "home"))
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    root = logging.getLogger()
-    before = root.handlers[:], root.level
+def run(
+    lerobot_command: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[..., None]]:
+    """Runs a command of LeRobot, which has a teleoperator that waves."""
     with made_up_site(tmp_path / "site", PLUGINS, monkeypatch) as site:
         site.add("waving", "waving.py")
         register_third_party_plugins()
-        yield command
-    root.handlers[:], root.level = before
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
+        yield lerobot_command
 
 
 def column(dataset: Path, name: str) -> np.ndarray:
