@@ -63,9 +63,26 @@ def samples(limits: dict[str, tuple[float, float]], count: int) -> list[dict[str
     return [{name: rng.uniform(*ends) for name, ends in limits.items()} for _ in range(count)]
 
 
+def shapes(model: mujoco.MjModel) -> list[tuple[Any, ...]]:
+    """What can collide: link, place, and size or mesh."""
+    found = []
+    for geom in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
+        place = (*model.geom_pos[geom], *model.geom_quat[geom])
+        mesh = int(model.geom_dataid[geom])
+        first, count = (int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])) if mesh >= 0 else (0, 0)
+        shape = model.mesh_vert[first : first + count].tobytes() or tuple(model.geom_size[geom])
+        found.append((model.body(int(model.geom_bodyid[geom])).name, int(model.geom_type[geom]), place, shape))
+    return found
+
+
 def compare(path: Path, tip: str | None, joints: tuple[str, ...], count: int = 6) -> int:
     """Compare the engines at random configurations; returns the number of compared links."""
     model = mujoco.MjModel.from_xml_path(str(path))
+    colliding = read_mjcf(path).spec.copy()
+    for name in read_mjcf(path).only_visible:
+        for geom in colliding.body(name).geoms:
+            geom.contype = 1
+    assert shapes(read_mjcf(path).solid) == shapes(colliding.compile())
     arm = read_arm(path, joints)
     scene = make_scene({"mjcf": str(path), "urdf": None, "tip": tip or ""})
     assert scene["problem"] == ""
@@ -186,7 +203,9 @@ def mjcfs(draw: st.DrawFn) -> tuple[dict[str, str], tuple[str, ...]]:
         framed = draw(st.booleans())
         text += f'<frame pos="{draw(TRIPLE)}" euler="{turn()}">' if framed else ""
         text += f'<body name="b{i}" pos="{draw(TRIPLE)}" euler="{turn()}"{childclass}>'
-        text += draw(st.sampled_from(['<geom type="mesh" mesh="box"/>', '<geom type="box" size="0.01 0.02 0.03"/>']))
+        looks = '<geom type="mesh" mesh="box" contype="0" conaffinity="0" pos="0 0 0.1"/>'
+        mesh, box = '<geom type="mesh" mesh="box"/>', '<geom type="box" size="0.01 0.02 0.03"/>'
+        text += draw(st.sampled_from([mesh, box, looks, mesh + looks, looks + box]))
         for _ in range(draw(st.integers(0 if i else 1, 2))):
             name = f"j{len(joints)}"
             joints.append(name)

@@ -73,11 +73,16 @@ class JointTree:
 
 @attrs.frozen(eq=False, slots=False)
 class Mjcf:
-    """An MJCF. Its models are compiled when they are first needed, and are not to be changed."""
+    """An MJCF. Its models are compiled when they are first needed, without their masses, and are not to be changed."""
 
     path: Path
     spec: Any = attrs.field(repr=False)
     """mujoco.MjSpec; copy it before changing it."""
+
+    @cached_property
+    def complete(self) -> Any:
+        """mujoco.MjModel with all shapes."""
+        return self._compiled(self.spec.copy())
 
     @cached_property
     def skeleton(self) -> Any:
@@ -85,19 +90,19 @@ class Mjcf:
         spec = self.spec.copy()
         for element in (*spec.sensors, *spec.pairs, *spec.geoms, *spec.meshes, *spec.materials, *spec.textures):
             spec.delete(element)
-        # Only the compiler needs a mass of each body, which may have come from its shapes.
-        spec.compiler.boundmass = spec.compiler.boundinertia = 1e-6
-        for joint in spec.joints:
-            joint.armature = 1.0
         return self._compiled(spec)
 
     @cached_property
     def solid(self) -> Any:
-        """mujoco.MjModel with shapes; bodies without collision geometry have the hulls of their visible meshes."""
+        """mujoco.MjModel with the shapes that can collide; bodies without any have hulls of their visible meshes."""
         spec = self.spec.copy()
         for body in _only_visible(spec):
             for geom in body.geoms:
                 geom.contype = 1  # makes the compiler compute its hull
+        # Meshes that are only looked at take nearly all the time to compile.
+        for element in (*spec.sensors, *spec.pairs, *(geom for geom in spec.geoms if not _collides(geom))):
+            spec.delete(element)
+        delete_unused_meshes(spec)
         return self._compiled(spec)
 
     @property
@@ -214,6 +219,10 @@ class Mjcf:
             body = int(model.body_parentid[body])
 
     def _compiled(self, spec: Any) -> Any:
+        # Only the compiler needs masses, which may come from shapes that went.
+        spec.compiler.boundmass = spec.compiler.boundinertia = 1e-6
+        for joint in spec.joints:
+            joint.armature = 1.0
         try:
             return spec.compile()
         except ValueError as error:
@@ -288,10 +297,20 @@ def mesh_name(mesh: Any) -> str:
     return mesh.name or Path(mesh.file).stem
 
 
+def delete_unused_meshes(spec: Any) -> None:
+    """Delete the meshes of a mujoco.MjSpec that no geom has."""
+    used = {geom.meshname for geom in spec.geoms}
+    for mesh in list(spec.meshes):
+        if mesh_name(mesh) not in used:
+            spec.delete(mesh)
+
+
 def _only_visible(spec: Any) -> list[Any]:
-    return [
-        body for body in spec.bodies if body.geoms and not any(geom.contype or geom.conaffinity for geom in body.geoms)
-    ]
+    return [body for body in spec.bodies if body.geoms and not any(map(_collides, body.geoms))]
+
+
+def _collides(geom: Any) -> bool:
+    return bool(geom.contype or geom.conaffinity)
 
 
 def robot_model(robot: Robot, joints: Sequence[str] | None = None) -> KinematicModel:

@@ -10,7 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from ibrobot_kinematics.errors import KinematicsError
-from ibrobot_kinematics.mjcf import mesh_name, read_mjcf, several_arms
+from ibrobot_kinematics.mjcf import delete_unused_meshes, mesh_name, read_mjcf, several_arms
 from ibrobot_kinematics.rotations import quaternion
 from numpy.typing import NDArray
 
@@ -243,11 +243,3 @@ def _simplify(spec: mujoco.MjSpec) -> None:
         mesh.uservert, mesh.userface = vertices.ravel(), faces.ravel()
         # Clustered meshes are not closed, so their inertia cannot be computed from a volume.
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-
-
-def delete_unused_meshes(spec: mujoco.MjSpec) -> None:
-    """Delete the meshes that no geom has."""
-    used = {geom.meshname for geom in spec.geoms if geom.type == _Mesh}
-    for mesh in list(spec.meshes):
-        if mesh_name(mesh) not in used:
-            spec.delete(mesh)

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from ibrobot_kinematics.errors import KinematicsError
 from ibrobot_kinematics.meshes import cluster
-from ibrobot_kinematics.mjcf import read_mjcf, several_arms
+from ibrobot_kinematics.mjcf import Mjcf, read_mjcf, several_arms
 from ibrobot_kinematics.rotations import from_quaternion, from_rpy, quaternion
 from ibrobot_kinematics.urdf import read_urdf
 from numpy.typing import NDArray
@@ -113,7 +113,7 @@ def _compiled(description: Mapping[str, Any]) -> Any:
     if not path:
         return None
     arms = description.get("arms") or {}
-    return several_arms(Path(path), arms).compile() if arms else read_mjcf(Path(path)).solid
+    return (Mjcf(Path(path), several_arms(Path(path), arms)) if arms else read_mjcf(Path(path))).complete
 
 
 def _body(model: Any, body: int, geoms: list[int], meshes: list[int]) -> dict[str, Any]:

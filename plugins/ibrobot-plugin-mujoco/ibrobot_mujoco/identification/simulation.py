@@ -9,11 +9,12 @@ from weakref import WeakKeyDictionary
 import attrs
 import mujoco
 import numpy as np
+from ibrobot_kinematics.mjcf import delete_unused_meshes
 from mujoco import rollout
 
 from ibrobot_core.api import Robot, Vector
 from ibrobot_mujoco.identification.recordings import Recording
-from ibrobot_mujoco.model import apply_parameters, build_spec, delete_unused_meshes
+from ibrobot_mujoco.model import apply_parameters, build_spec
 from ibrobot_mujoco.options import MujocoOptions
 from ibrobot_mujoco.parameters import ArmParameters, JointParameters, read_parameters
 from ibrobot_mujoco.scenes import scene
