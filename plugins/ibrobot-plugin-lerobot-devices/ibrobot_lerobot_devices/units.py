@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import attrs
-import numpy as np
 
-from ibrobot_core.api import Vector
+if TYPE_CHECKING:
+    from ibrobot_core.api import Vector
 
 POSITION = (".pos", ".q")
 """Ends of the names of features that are joint positions."""
@@ -196,4 +196,6 @@ def _by_calibration(unit: str, motor: Mapping[str, Any], joint: str, choices: Ch
 
 def columns(mapped: Sequence[Mapped]) -> tuple[Vector, Vector]:
     """Factors and offsets of joints, each of shape (J,)."""
+    import numpy as np
+
     return np.array([each.scale.factor for each in mapped]), np.array([each.scale.offset for each in mapped])
