@@ -16,7 +16,7 @@ from ibrobot_feetech.calibration import save_calibration
 from ibrobot_feetech.emulator import Emulator
 from ibrobot_feetech.follower import FeetechFollower
 from ibrobot_feetech.options import FollowerOptions
-from ibrobot_lerobot_devices import hardware
+from ibrobot_lerobot_devices import hardware, link
 from ibrobot_lerobot_devices.hardware import LeRobotHardware
 from ibrobot_lerobot_devices.options import RobotOptions
 from ibrobot_testing.contexts import control_context, make_robot
@@ -90,6 +90,7 @@ def patient_devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: py
     monkeypatch.setattr(hardware, "_WAIT", PATIENCE_S * 100)
     if "clock" in request.fixturenames:  # the real age of an answer would be one of another clock
         monkeypatch.setattr(hardware, "age_ns", lambda answer: 0)
+    monkeypatch.setattr(link, "_FAREWELL_S", PATIENCE_S)
     monkeypatch.setattr(hardware, "_RELAX_S", PATIENCE_S)
     monkeypatch.setattr(hardware, "_RECONNECT_S", PATIENCE_S)
 

@@ -22,8 +22,6 @@ from ibrobot_core.app import Channel, ComponentFailed, run_child
 from ibrobot_lerobot_devices.stand_in import replace_torch
 from ibrobot_lerobot_devices.units import driven
 
-_FAREWELL_S = 1.0
-"""How long a call may go on after the parent has ended or died [s]."""
 _SILENCE_S = 0.25
 """How old the newest action that a base drives by may get; then it stands [s]."""
 _AGAIN_S = 0.05
@@ -35,8 +33,9 @@ _EARLY = 0.9
 """How early a picture may be taken, as a share of the camera's period."""
 _LOOK_S = 0.004
 """Time between looks for a new picture, at a camera that does not wait for one [s]."""
-READY, ANSWER, DONE, TRAFFIC = "ready", "answer", "done", "traffic"
-"""Events: it is connected; a reading or why there is none; a request is carried out; what its ports received."""
+READY, ANSWER, DONE, TRAFFIC, END = "ready", "answer", "done", "traffic", "end"
+"""Events: it is connected; a reading or why there is none; a request is carried out; what its ports received; the
+device is released, and a base stands."""
 STAND = "stand"
 """The request to let a base stand."""
 CONNECT = "connect"
@@ -78,6 +77,8 @@ class Requests:
     """Requests of the parent, in order; of actions, and of requests to read or to stand, only the newest counts."""
 
     channel: Channel
+    farewell_s: float = 1.0
+    """How long a call may go on after the parent has ended or died [s]."""
     traffic: Traffic = attrs.field(factory=Traffic)
     _waiting: queue.SimpleQueue[dict[str, Any]] = attrs.field(factory=queue.SimpleQueue)
     _newest: dict[str, dict[str, Any]] = attrs.field(factory=dict)
@@ -113,7 +114,7 @@ class Requests:
         while (request := self.channel.next(None)) is not None and request["do"] != "end":
             self.put(request)
         self._waiting.put(_END)
-        if not self.ended.wait(_FAREWELL_S):
+        if not self.ended.wait(self.farewell_s):
             os._exit(1)
 
 
@@ -310,12 +311,15 @@ class Device:
         self.disconnect()
         return self.connect()
 
-    def disconnect(self) -> None:
-        """Release the device; its torque stays as it is."""
+    def disconnect(self) -> bool:
+        """Release the device; its torque stays as it is. Returns whether a base stands."""
+        stands = False
         with contextlib.suppress(Exception):  # e.g. since its cable is out
             self.stand()
+            stands = True
         with contextlib.suppress(Exception):  # also since it is not connected
             self._device.disconnect()
+        return stands
 
 
 def _one_line(error: BaseException) -> str:
@@ -383,7 +387,7 @@ def run(channel: Channel, order: Mapping[str, Any]) -> None:
     Raises:
         ComponentFailed: with LeRobot's error in one line.
     """
-    requests = Requests(channel)
+    requests = Requests(channel, order["farewell_s"])
     try:
         _run(channel, order, requests)
     except Exception as error:  # noqa: BLE001 - of LeRobot, whatever it is
@@ -415,7 +419,8 @@ def _run(channel: Channel, order: Mapping[str, Any], requests: Requests) -> None
         channel.send({"event": READY, "found": description})
         serve(device, requests)
     finally:
-        device.disconnect()
+        if device.disconnect():
+            channel.send({"event": END})
 
 
 if __name__ == "__main__":

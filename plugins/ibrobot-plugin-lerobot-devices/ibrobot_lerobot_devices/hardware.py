@@ -212,7 +212,8 @@ class LeRobotHardware(Hardware):
         if self._link.pid is not None and self._fault is None:
             self._ctx.log.info("%s: LeRobot reports no torque, temperature or voltage of its motors", self._ctx.name)
         self._fault, self._starting, self._standing = self._error("is not connected"), False, None
-        self._link.end()
+        if not self._link.end() and self._base.features:
+            self._ctx.log.error("%s: %s", self._ctx.name, MAY_DRIVE)
 
     @override
     def counters(self) -> Mapping[str, int]:

@@ -10,13 +10,15 @@ from typing import Any
 
 from ibrobot_core.api import how_to_install
 from ibrobot_core.app import ChannelMessage, Child, ComponentFailed
-from ibrobot_lerobot_devices.device import ANSWER, CONNECT, DONE, READY, STAND, TRAFFIC
+from ibrobot_lerobot_devices.device import ANSWER, CONNECT, DONE, END, READY, STAND, TRAFFIC
 
 INSTALL = how_to_install("lerobot")
 """The command that installs LeRobot; its devices need extras, e.g. `lerobot[feetech]`."""
 _MODULE = "ibrobot_lerobot_devices.device"
-_END_S = 1.5
-"""How long a device process may take to end [s]; then it is killed."""
+_FAREWELL_S = 1.0
+"""How long a call may go on after the parent has ended or died [s]."""
+_END_S = 0.5
+"""How much longer the device process may take to end [s]; then it is killed."""
 _TRAFFIC_S = 0.02
 """Wait of a fault for the report of the ports' traffic [s]."""
 _MANY = 1 << 16
@@ -107,7 +109,7 @@ class DeviceLink:
             self._standby = self._start({**self._order, "waits": True})
 
     def _start(self, order: Mapping[str, Any]) -> Child:
-        return Child(_MODULE, order, end_s=_END_S)
+        return Child(_MODULE, {**order, "farewell_s": _FAREWELL_S}, end_s=_FAREWELL_S + _END_S)
 
     def poll_start(self, timeout_s: float) -> Mapping[str, Any] | None:
         """What the device says about itself, once it is connected; None if that takes more than `timeout_s` [s].
@@ -235,19 +237,21 @@ class DeviceLink:
         self.refused = (0, "")
         return answer
 
-    def end(self) -> None:
-        """End the process; safe at any time."""
+    def end(self) -> bool:
+        """End the process; safe at any time. Returns whether it has released its device, so that a base stands."""
         self._end_standby()
-        self._end_child()
+        return self._end_child()
 
-    def _end_child(self) -> None:
+    def _end_child(self) -> bool:
         child, self._child = self._child, None
-        if child is not None:
-            child.channel.send({"do": "end"})
-            if child.end():
-                logging.getLogger("ibrobot.lerobot").warning("%s did not end, and was killed", self.type)
-            child.receive()  # what it has logged
-            child.channel.close()
+        if child is None:
+            return True
+        child.channel.send({"do": "end"})
+        if child.end():
+            logging.getLogger("ibrobot.lerobot").warning("%s did not end, and was killed", self.type)
+        said = child.receive()  # also what it has logged
+        child.channel.close()
+        return any(message["event"] == END for message in said)
 
     def _end_standby(self) -> None:
         standby, self._standby = self._standby, None

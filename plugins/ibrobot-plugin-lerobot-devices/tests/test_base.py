@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, override
 
 import numpy as np
 import pytest
-from ibrobot_lerobot_devices import hardware
+from ibrobot_lerobot_devices import hardware, link
 from ibrobot_lerobot_devices.cmd_vel import CmdVelTeleop
 from ibrobot_lerobot_devices.hardware import LeRobotHardware
 from ibrobot_lerobot_devices.options import CmdVelOptions, RobotOptions
+from ibrobot_lerobot_devices.standing import MAY_DRIVE
 from ibrobot_testing import TeleopSuite
 from ibrobot_testing.contexts import START_NS, SetClock, control_context, host_context
 
@@ -111,7 +114,7 @@ class TestAxes:
                 base.read()
             assert driven(motors) == [0.0, 0.0, 0.0]
 
-    def test_a_base_stands_at_the_end(self, motors: Motors) -> None:
+    def test_a_base_stands_at_the_end(self, motors: Motors, caplog: pytest.LogCaptureFixture) -> None:
         with connected(motors) as (base, _):
             begun = base.read().position
             base.write(begun)
@@ -119,6 +122,21 @@ class TestAxes:
             base.read()
             assert driven(motors)[0] > 0
         assert driven(motors) == [0.0, 0.0, 0.0]
+        assert MAY_DRIVE not in caplog.text
+
+    @pytest.mark.parametrize("fails", ["process", "device"])
+    def test_an_end_at_which_the_base_may_drive_on_says_so(
+        self, motors: Motors, fails: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        monkeypatch.setattr(link, "_FAREWELL_S", 0.1)
+        with connected(motors) as (base, _):
+            base.read()
+            if fails == "process":
+                assert base._link.pid is not None
+                os.kill(base._link.pid, signal.SIGSTOP)
+            else:
+                motors.suffer("fail")
+        assert f"base: {MAY_DRIVE}" in caplog.text
 
     def test_an_axis_that_lerobot_does_not_measure_is_named(self, motors: Motors) -> None:
         with (
