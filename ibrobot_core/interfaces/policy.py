@@ -1,4 +1,4 @@
-"""Policies, which compute action chunks from observations in three pure steps."""
+"""Policies, which compute action chunks from observations in three pure steps, and the units of their vectors."""
 
 from __future__ import annotations
 

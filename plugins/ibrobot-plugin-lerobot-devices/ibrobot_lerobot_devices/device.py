@@ -77,7 +77,7 @@ class Requests:
     """Requests of the parent, in order; of actions, and of requests to read or to stand, only the newest counts."""
 
     channel: Channel
-    farewell_s: float = 1.0
+    farewell_s: float
     """How long a call may go on after the parent has ended or died [s]."""
     traffic: Traffic = attrs.field(factory=Traffic)
     _waiting: queue.SimpleQueue[dict[str, Any]] = attrs.field(factory=queue.SimpleQueue)

@@ -146,7 +146,7 @@ class FakeChild:
         self._inbox: list[dict[str, Any]] = []
         self._device = device.Device(order)
         self.channel = SimpleNamespace(send=self._receive, backlog=0, close=lambda: None)
-        self._requests = device.Requests(SimpleNamespace(send=self._send))  # type: ignore[arg-type]
+        self._requests = device.Requests(SimpleNamespace(send=self._send), 1.0)  # type: ignore[arg-type]
         self._waits = bool(order["waits"])
         self._connected = False
         self._busy_ns = world.clock.now_ns() + ns(_IMPORT_S if world.started else 0.0)
